@@ -1,0 +1,359 @@
+//! Wire schema v1: what crosses the bus, in bincode and in JSON.
+//!
+//! Bincode 2 with fixed-size little-endian integers and no framing, so that `struct` and `numpy.frombuffer` read
+//! it: integers and floats are their bytes, a `Vec` or `String` is a `u64` length and its elements, fields follow
+//! each other in the order declared here. Every message starts with the schema version.
+//!
+//! | key under `PREFIX/BED/` | type | |
+//! |---|---|---|
+//! | `pressure/CHANNEL` | [`PressureBlock`] | in; JSON accepted with encoding `application/json` |
+//! | `truth` | [`Truth`] | what a synthetic patient really is; published by `replay` |
+//! | `estimate/state` | [`StateEstimate`] | |
+//! | `estimate/parameters` | [`ParameterEstimate`] | |
+//! | `estimate/members` | [`Members`] | only while someone subscribes |
+//! | `status` | [`Status`] | |
+//! | `event` | [`Event`] | |
+//!
+//! Each `out` key has a twin `KEY/json`. The JSON holds the same content, arranged by name; numbers that JSON
+//! cannot hold (NaN) are `null`. The arrays are described in the types.
+
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use serde_json::{Map, Value, json};
+
+use super::bus::Encoding;
+
+/// Version of everything in this module.
+pub const SCHEMA: u16 = 1;
+
+/// Longest payload that is decoded \[bytes\]; also bounds what a corrupt length can allocate.
+pub const MAX_PAYLOAD_BYTES: usize = 1 << 20;
+
+/// [`PressureBlock::flags`]: the sender will send no more.
+pub const FLAG_LAST_BLOCK: u32 = 1;
+
+/// Statistics per quantity in [`StateEstimate::values`], in order.
+pub const STATE_STATISTICS: [&str; 7] = ["mean", "sd", "epistemic_sd", "aleatoric_sd", "model_sd", "q05", "q95"];
+
+/// Statistics per parameter in [`ParameterEstimate::values`], in order.
+pub const PARAMETER_STATISTICS: [&str; 6] = ["mean", "sd", "q05", "q95", "identifiability", "since_informed_s"];
+
+/// A block of samples of one channel.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PressureBlock {
+    /// [`SCHEMA`].
+    pub schema: u16,
+    /// Counts the blocks of this channel, so that losses show.
+    pub sequence: u64,
+    /// Bit set of `FLAG_...`.
+    pub flags: u32,
+    /// Event time of the first sample \[ns\].
+    pub start_ns: i64,
+    /// Spacing \[ns\]; 0 if `offsets_ns` tells the times.
+    pub period_ns: i64,
+    /// Time of each sample after `start_ns` \[ns\]; empty if `period_ns` tells the times.
+    #[serde(default)]
+    pub offsets_ns: Vec<i64>,
+    /// Samples \[mmHg\].
+    pub values: Vec<f64>,
+}
+
+/// What every published message starts with.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Header {
+    /// [`SCHEMA`].
+    pub schema: u16,
+    /// Seed of the ensemble.
+    pub seed: u64,
+    /// Hash of the effective configuration.
+    pub config_hash: u64,
+    /// Counts the messages under this key.
+    pub sequence: u64,
+    /// Event time of the (first) content \[ns\].
+    pub time_ns: i64,
+}
+
+/// Pressures, flows and volumes with their uncertainty, at one or more times.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StateEstimate {
+    /// Common start.
+    pub header: Header,
+    /// Members that took part.
+    pub members: u32,
+    /// Event times \[ns\].
+    pub times_ns: Vec<i64>,
+    /// Seconds since data last entered the estimate, per time; a forecast where it exceeds a sampling interval.
+    pub since_data_s: Vec<f64>,
+    /// Names of the quantities.
+    pub names: Vec<String>,
+    /// `[times x names x 7]`, the [`STATE_STATISTICS`] of each. `q05` and `q95` describe the true quantity.
+    pub values: Vec<f64>,
+}
+
+/// Estimated parameters.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ParameterEstimate {
+    /// Common start.
+    pub header: Header,
+    /// Members that took part.
+    pub members: u32,
+    /// Names of the parameters.
+    pub names: Vec<String>,
+    /// `[names x 6]`, the [`PARAMETER_STATISTICS`] of each.
+    pub values: Vec<f64>,
+}
+
+/// The whole ensemble at one time.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Members {
+    /// Common start.
+    pub header: Header,
+    /// Names of the columns: states, then estimated parameters.
+    pub names: Vec<String>,
+    /// `[members x names]`.
+    pub values: Vec<f64>,
+}
+
+/// One channel in a [`Status`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ChannelStatus {
+    /// State it observes.
+    pub name: String,
+    /// `live`, `silent` or `never`.
+    pub state: String,
+    /// Event time of its last sample \[ns\].
+    pub last_sample_ns: i64,
+    /// Samples that entered the estimate.
+    pub samples_used: u64,
+    /// Root mean square of the normalised innovations, lately: 1 when model and noise fit.
+    pub innovation_rms: f64,
+}
+
+/// Health of a bed, once a second.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Status {
+    /// Common start.
+    pub header: Header,
+    /// Members alive, of those configured.
+    pub members_alive: u32,
+    /// Members configured.
+    pub members: u32,
+    /// Windows solved since the start.
+    pub windows: u64,
+    /// Of these, without a sample: forecasts.
+    pub windows_without_data: u64,
+    /// From the arrival of the input that closed a window to its estimate, since the start \[ms\]: median.
+    pub lag_p50_ms: f64,
+    /// The same: 99th percentile.
+    pub lag_p99_ms: f64,
+    /// The same: largest.
+    pub lag_max_ms: f64,
+    /// Mean time to solve a window for all members, lately \[ms\].
+    pub solve_ms: f64,
+    /// Mean Gauss-Newton iterations per member and window.
+    pub iterations: f64,
+    /// Member-windows whose iteration did not converge.
+    pub not_converged: u64,
+    /// Inputs waiting.
+    pub queue_depth: u32,
+    /// What was refused or lost, by cause; causes with count 0 are left out.
+    pub counters: Vec<(String, u64)>,
+    /// Channels that are observed or configured to be.
+    pub channels: Vec<ChannelStatus>,
+}
+
+/// Something happened.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Event {
+    /// Common start.
+    pub header: Header,
+    /// `start`, `gap`, `recovered`, `restart`, `rejected`, `overload`, `members_lost`, ...
+    pub kind: String,
+    /// Channel concerned; empty if none.
+    pub channel: String,
+    /// For people.
+    pub text: String,
+}
+
+/// What a synthetic patient really is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Truth {
+    /// [`SCHEMA`].
+    pub schema: u16,
+    /// Event time \[ns\].
+    pub time_ns: i64,
+    /// Names of the quantities and parameters.
+    pub names: Vec<String>,
+    /// Their values.
+    pub values: Vec<f64>,
+}
+
+/// A payload that cannot be understood.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum WireError {
+    /// Longer than [`MAX_PAYLOAD_BYTES`].
+    #[error("payload of {0} bytes, at most {MAX_PAYLOAD_BYTES} are accepted")]
+    TooLong(usize),
+    /// Not the bytes of this type.
+    #[error("not a valid message: {0}")]
+    Malformed(String),
+    /// Written by another version.
+    #[error("schema version {0}, this build reads {SCHEMA}")]
+    Schema(u16),
+}
+
+fn bincode_config() -> impl bincode::config::Config {
+    bincode::config::standard().with_little_endian().with_fixed_int_encoding().with_limit::<MAX_PAYLOAD_BYTES>()
+}
+
+/// Bincode bytes of a message of this module.
+///
+/// # Errors
+/// When the message is longer than [`MAX_PAYLOAD_BYTES`].
+pub fn encode<T: Serialize>(message: &T) -> Result<Vec<u8>, WireError> {
+    bincode::serde::encode_to_vec(message, bincode_config()).map_err(|e| WireError::Malformed(e.to_string()))
+}
+
+/// Reads a message of this module; the schema version is looked at before anything else.
+///
+/// # Errors
+/// When the payload is too long, of another schema version, or malformed (trailing bytes included).
+pub fn decode<T: DeserializeOwned>(payload: &[u8], encoding: Encoding) -> Result<T, WireError> {
+    if payload.len() > MAX_PAYLOAD_BYTES {
+        return Err(WireError::TooLong(payload.len()));
+    }
+    match encoding {
+        Encoding::Bincode => decode_bincode(payload),
+        Encoding::Json => decode_json(payload),
+    }
+}
+
+fn decode_bincode<T: DeserializeOwned>(payload: &[u8]) -> Result<T, WireError> {
+    let Some(version) = payload.first_chunk::<2>() else {
+        return Err(WireError::Malformed(format!("{} bytes", payload.len())));
+    };
+    check_schema(u64::from(u16::from_le_bytes(*version)))?;
+    let (message, used) = bincode::serde::decode_from_slice(payload, bincode_config())
+        .map_err(|e| WireError::Malformed(e.to_string()))?;
+    if used != payload.len() {
+        return Err(WireError::Malformed(format!("{} bytes left over", payload.len() - used)));
+    }
+    Ok(message)
+}
+
+fn decode_json<T: DeserializeOwned>(payload: &[u8]) -> Result<T, WireError> {
+    let malformed = |e: serde_json::Error| WireError::Malformed(e.to_string());
+    let value: Value = serde_json::from_slice(payload).map_err(malformed)?;
+    let Some(version) = value.get("schema").and_then(Value::as_u64) else {
+        return Err(WireError::Malformed("no `schema`".to_owned()));
+    };
+    check_schema(version)?;
+    serde_json::from_value(value).map_err(malformed)
+}
+
+fn check_schema(version: u64) -> Result<(), WireError> {
+    if version == u64::from(SCHEMA) {
+        Ok(())
+    } else {
+        Err(WireError::Schema(u16::try_from(version).unwrap_or(u16::MAX)))
+    }
+}
+
+/// The JSON twin of a published message.
+pub trait ToJson: Serialize {
+    /// The same content, arranged by name.
+    fn to_json(&self) -> Value;
+}
+
+fn with_header(header: &Header, body: Value) -> Value {
+    let mut map = Map::new();
+    map.insert("schema".into(), json!(header.schema));
+    map.insert("seed".into(), json!(header.seed));
+    // Beyond 2^53: JavaScript would round it.
+    map.insert("config_hash".into(), json!(format!("{:016x}", header.config_hash)));
+    map.insert("sequence".into(), json!(header.sequence));
+    map.insert("time_ns".into(), json!(header.time_ns));
+    if let Value::Object(body) = body {
+        map.extend(body);
+    }
+    Value::Object(map)
+}
+
+impl ToJson for StateEstimate {
+    fn to_json(&self) -> Value {
+        let (n, k) = (self.names.len(), STATE_STATISTICS.len());
+        let quantity = |q: usize| -> Value {
+            let series = |s: usize| (0..self.times_ns.len()).map(|t| self.values[(t * n + q) * k + s]).collect();
+            STATE_STATISTICS.iter().enumerate().map(|(s, name)| (*name, series(s))).collect::<Series>().into()
+        };
+        let quantities: Map<String, Value> =
+            self.names.iter().enumerate().map(|(q, name)| (name.clone(), quantity(q))).collect();
+        with_header(
+            &self.header,
+            json!({
+                "members": self.members, "times_ns": self.times_ns, "since_data_s": self.since_data_s,
+                "quantities": quantities,
+            }),
+        )
+    }
+}
+
+/// Named rows of numbers on their way to JSON.
+#[derive(Default)]
+struct Series(Map<String, Value>);
+
+impl<'a> FromIterator<(&'a str, Vec<f64>)> for Series {
+    fn from_iter<I: IntoIterator<Item = (&'a str, Vec<f64>)>>(rows: I) -> Self {
+        Self(rows.into_iter().map(|(name, row)| (name.to_owned(), json!(row))).collect())
+    }
+}
+
+impl From<Series> for Value {
+    fn from(series: Series) -> Self {
+        Self::Object(series.0)
+    }
+}
+
+impl ToJson for ParameterEstimate {
+    fn to_json(&self) -> Value {
+        let k = PARAMETER_STATISTICS.len();
+        let parameter = |p: usize| -> Map<String, Value> {
+            let row = &self.values[p * k..(p + 1) * k];
+            PARAMETER_STATISTICS.iter().zip(row).map(|(name, value)| ((*name).to_owned(), json!(value))).collect()
+        };
+        let parameters: Map<String, Value> =
+            self.names.iter().enumerate().map(|(p, name)| (name.clone(), Value::Object(parameter(p)))).collect();
+        with_header(&self.header, json!({ "members": self.members, "parameters": parameters }))
+    }
+}
+
+impl ToJson for Members {
+    fn to_json(&self) -> Value {
+        let members: Vec<&[f64]> = self.values.chunks(self.names.len().max(1)).collect();
+        with_header(&self.header, json!({ "names": self.names, "members": members }))
+    }
+}
+
+impl ToJson for Status {
+    fn to_json(&self) -> Value {
+        let mut body = serde_json::to_value(self).unwrap_or(Value::Null);
+        if let Value::Object(map) = &mut body {
+            map.remove("header");
+            map.insert("counters".into(), self.counters.iter().cloned().map(|(k, v)| (k, json!(v))).collect());
+        }
+        with_header(&self.header, body)
+    }
+}
+
+impl ToJson for Event {
+    fn to_json(&self) -> Value {
+        with_header(&self.header, json!({ "kind": self.kind, "channel": self.channel, "text": self.text }))
+    }
+}
+
+impl ToJson for Truth {
+    fn to_json(&self) -> Value {
+        let values: Map<String, Value> =
+            self.names.iter().zip(&self.values).map(|(name, value)| (name.clone(), json!(value))).collect();
+        json!({ "schema": self.schema, "time_ns": self.time_ns, "values": values })
+    }
+}

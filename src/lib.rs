@@ -1,0 +1,3 @@
+//! hemostream
+pub mod edge;
+pub mod model;
