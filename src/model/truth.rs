@@ -1,20 +1,23 @@
 //! The truth simulator: a model integrated by an adaptive stiff solver, independent of X-TFC.
 //!
-//! Radau IIA of order 5 with step control (crate `differential-equations`), restarted wherever the right-hand
-//! side is not smooth in time: corners of the model and scripted parameter changes.
+//! Variable-order backward differentiation with step control (crate `diffsol`), restarted wherever the right-hand
+//! side is not smooth in time: corners of the model and scripted parameter changes. Kinks that depend on the state
+//! (valves) are found by the step control.
 
-use differential_equations::linalg::Matrix;
-use differential_equations::methods::ImplicitRungeKutta;
-use differential_equations::ode::{ODE, OrdinaryNumericalMethod, solve_ode};
-use differential_equations::solout::DefaultSolout;
+use diffsol::{NalgebraLU, NalgebraMat, OdeBuilder, OdeSolverMethod, OdeSolverStopReason, VectorCommon};
+
+use std::collections::VecDeque;
 
 use super::Model;
 
 /// Relative and absolute \[mmHg\] tolerance of the integrator, per step.
-pub const TOLERANCE: f64 = 1e-9;
+const TOLERANCE: f64 = 1e-10;
 
-/// Restarts within one call of [`Simulator::advance_to`]; more means that a model reports corners without end.
-const MAX_SEGMENTS: usize = 1_000_000;
+/// Longest stretch integrated at once \[s\]; models without corners need an end.
+const MAX_SEGMENT_S: f64 = 1.0;
+
+/// Steps within one segment; more means that the tolerance cannot be met.
+const MAX_STEPS: usize = 1_000_000;
 
 /// Parameters that take new values at a given time.
 #[derive(Debug, Clone, PartialEq)]
@@ -43,8 +46,44 @@ pub struct Simulator<M> {
     theta: Vec<f64>,
     x: Vec<f64>,
     time_s: f64,
+    /// Integrated already, from a corner to the next.
+    segment: Segment,
     /// Still to come, in order of time.
-    script: std::collections::VecDeque<Change>,
+    script: VecDeque<Change>,
+}
+
+/// A stretch without corners: the steps of the integrator and what they started from.
+#[derive(Debug, Clone)]
+struct Segment {
+    start_s: f64,
+    end_s: f64,
+    /// At the start.
+    theta: Vec<f64>,
+    /// In order of time; never empty.
+    steps: Vec<Step>,
+}
+
+/// State and derivative at the end of a step; time since the start of the segment.
+#[derive(Debug, Clone)]
+struct Step {
+    t: f64,
+    x: Vec<f64>,
+    dx: Vec<f64>,
+}
+
+impl Segment {
+    /// The state `t` after the start, by cubic Hermite interpolation between steps.
+    fn state(&self, t: f64) -> Vec<f64> {
+        let after = self.steps.partition_point(|step| step.t < t).clamp(1, self.steps.len().max(2) - 1);
+        let (Some(a), Some(b)) = (self.steps.get(after - 1), self.steps.get(after)) else {
+            return self.steps[0].x.clone();
+        };
+        let h = b.t - a.t;
+        let s = (t - a.t) / h;
+        let (from, to) = ((1.0 + 2.0 * s) * (1.0 - s) * (1.0 - s), s * s * (3.0 - 2.0 * s));
+        let (slope_from, slope_to) = (h * s * (1.0 - s) * (1.0 - s), h * s * s * (s - 1.0));
+        (0..a.x.len()).map(|i| from * a.x[i] + to * b.x[i] + slope_from * a.dx[i] + slope_to * b.dx[i]).collect()
+    }
 }
 
 impl<M: Model> Simulator<M> {
@@ -52,7 +91,9 @@ impl<M: Model> Simulator<M> {
     #[must_use]
     pub fn new(model: M, x0: Vec<f64>, theta: Vec<f64>, mut script: Vec<Change>) -> Self {
         script.sort_by(|a, b| a.at_s.total_cmp(&b.at_s));
-        let mut simulator = Self { model, theta, x: x0, time_s: 0.0, script: script.into() };
+        let start = Step { t: 0.0, x: x0.clone(), dx: vec![0.0; x0.len()] };
+        let segment = Segment { start_s: 0.0, end_s: 0.0, theta: theta.clone(), steps: vec![start] };
+        let mut simulator = Self { model, theta, x: x0, time_s: 0.0, segment, script: script.into() };
         simulator.apply_due_changes();
         simulator
     }
@@ -88,37 +129,78 @@ impl<M: Model> Simulator<M> {
     /// # Errors
     /// When the integrator gives up (parameters without a bounded solution).
     pub fn advance_to(&mut self, time_s: f64) -> Result<(), SimulationError> {
-        for _ in 0..MAX_SEGMENTS {
-            if self.time_s >= time_s {
-                return Ok(());
-            }
-            let change = self.script.front().map_or(f64::INFINITY, |c| c.at_s);
-            let end = time_s.min(change);
-            let corner = self.model.next_corner(0.0, end - self.time_s, &self.theta);
-            self.integrate_to(corner.map_or(end, |c| self.time_s + c))?;
-            self.apply_due_changes();
+        if time_s <= self.time_s {
+            return Ok(());
         }
-        Err(self.failure("too many corners".to_owned()))
+        while time_s >= self.segment.end_s {
+            self.move_to(self.segment.end_s);
+            self.apply_due_changes();
+            self.segment = self.integrate()?;
+        }
+        self.move_to(time_s);
+        Ok(())
     }
 
-    /// Integrates over a stretch without corners.
-    fn integrate_to(&mut self, end_s: f64) -> Result<(), SimulationError> {
-        let span_s = end_s - self.time_s;
-        let system = System { model: &self.model, theta: &self.theta };
-        let mut method = ImplicitRungeKutta::radau5()
-            .rtol(TOLERANCE)
-            .atol(TOLERANCE)
-            .h0((1e-4_f64).min(0.5 * span_s))
-            .max_steps(1_000_000);
-        let solved = solve_with(&mut method, &system, span_s, &self.x);
-        let x = solved.map_err(|reason| self.failure(reason))?;
-        if !x.iter().all(|v| v.is_finite()) {
-            return Err(self.failure("the state is not finite".to_owned()));
+    /// Moves within the segment.
+    fn move_to(&mut self, time_s: f64) {
+        let t = time_s - self.segment.start_s;
+        self.x = self.segment.state(t);
+        self.theta.clone_from(&self.segment.theta);
+        self.model.advance(t, &mut self.theta);
+        self.time_s = time_s;
+    }
+
+    /// Integrates from now to the next corner or change.
+    fn integrate(&self) -> Result<Segment, SimulationError> {
+        let change = self.script.front().map_or(f64::INFINITY, |c| c.at_s - self.time_s);
+        let limit = MAX_SEGMENT_S.min(change);
+        let span_s = self.model.next_corner(0.0, limit, &self.theta).unwrap_or(limit);
+        let steps = self
+            .solve(span_s)
+            .map_err(|reason| SimulationError { at_s: self.time_s, reason: reason.to_string() })?;
+        if !steps.iter().all(|step| step.x.iter().all(|v| v.is_finite())) {
+            return Err(SimulationError { at_s: self.time_s, reason: "the state is not finite".to_owned() });
         }
-        self.x = x;
-        self.model.advance(span_s, &mut self.theta);
-        self.time_s = end_s;
-        Ok(())
+        let theta = self.theta.clone();
+        Ok(Segment { start_s: self.time_s, end_s: self.time_s + span_s, theta, steps })
+    }
+
+    fn solve(&self, span_s: f64) -> Result<Vec<Step>, diffsol::error::DiffsolError> {
+        let n = self.x.len();
+        let (model, theta, x0) = (&self.model, &self.theta, &self.x);
+        let problem = OdeBuilder::<NalgebraMat<f64>>::new()
+            .rhs_implicit(
+                |x, _, t, dx| model.rhs(t, x, theta, dx),
+                |x, _, t, v, jv| {
+                    let (mut f, mut dfdx) = (vec![0.0; n], vec![0.0; n * n]);
+                    model.rhs_and_state_jacobian(t, x, theta, &mut f, &mut dfdx);
+                    for (row, out) in dfdx.chunks_exact(n).zip(jv.iter_mut()) {
+                        *out = row.iter().zip(v).map(|(a, b)| a * b).sum();
+                    }
+                },
+            )
+            .init(|_, _, x| x.copy_from_slice(x0), n)
+            .rtol(TOLERANCE)
+            .atol([TOLERANCE])
+            .h0(1e-5_f64.min(span_s))
+            .build()?;
+        let mut solver = problem.bdf::<NalgebraLU<f64>>()?;
+        solver.set_stop_time(span_s)?;
+        let record = |t: f64, x: &[f64]| {
+            let mut dx = vec![0.0; n];
+            model.rhs(t, x, theta, &mut dx);
+            Step { t, x: x.to_vec(), dx }
+        };
+        let mut steps = vec![record(0.0, x0)];
+        for _ in 0..MAX_STEPS {
+            let reason = solver.step()?;
+            let state = solver.state();
+            steps.push(record(state.t, state.y.inner().as_slice()));
+            if matches!(reason, OdeSolverStopReason::TstopReached) {
+                break;
+            }
+        }
+        Ok(steps)
     }
 
     fn apply_due_changes(&mut self) {
@@ -134,35 +216,3 @@ impl<M: Model> Simulator<M> {
     }
 }
 
-fn solve_with<S, N>(method: &mut N, system: &S, span_s: f64, x0: &[f64]) -> Result<Vec<f64>, String>
-where
-    S: ODE<f64, Vec<f64>>,
-    N: OrdinaryNumericalMethod<f64, Vec<f64>> + differential_equations::interpolate::Interpolation<f64, Vec<f64>>,
-{
-    let solution = solve_ode(method, system, 0.0, span_s, &x0.to_vec(), &mut DefaultSolout::new())
-        .map_err(|error| error.to_string())?;
-    solution.y.last().cloned().ok_or_else(|| "no step was made".to_owned())
-}
-
-/// The model with parameters held, as the integrator wants it.
-struct System<'a, M> {
-    model: &'a M,
-    theta: &'a [f64],
-}
-
-impl<M: Model> ODE<f64, Vec<f64>> for System<'_, M> {
-    fn diff(&self, t: f64, y: &Vec<f64>, dydt: &mut Vec<f64>) {
-        self.model.rhs(t, y, self.theta, dydt);
-    }
-
-    fn jacobian(&self, t: f64, y: &Vec<f64>, j: &mut Matrix<f64>) {
-        let n = y.len();
-        let (mut f, mut dfdx) = (vec![0.0; n], vec![0.0; n * n]);
-        self.model.rhs_and_state_jacobian(t, y, self.theta, &mut f, &mut dfdx);
-        for row in 0..n {
-            for column in 0..n {
-                j[(row, column)] = dfdx[row * n + column];
-            }
-        }
-    }
-}
