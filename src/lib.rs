@@ -1,3 +1,4 @@
 //! hemostream
 pub mod edge;
 pub mod model;
+pub mod xtfc;

@@ -210,9 +210,5 @@ impl<M: Model> Simulator<M> {
             }
         }
     }
-
-    fn failure(&self, reason: String) -> SimulationError {
-        SimulationError { at_s: self.time_s, reason }
-    }
 }
 
