@@ -1,4 +1,6 @@
 //! hemostream
 pub mod edge;
+pub mod estimate;
 pub mod model;
+pub mod runtime;
 pub mod xtfc;

@@ -63,12 +63,12 @@ pub type LastValues = Arc<dyn Fn(&str) -> Vec<Message> + Send + Sync>;
 
 /// Ends a subscription (or an answering service) when dropped.
 pub struct Subscription {
-    _guard: Box<dyn std::any::Any + Send>,
+    _guard: Box<dyn std::any::Any + Send + Sync>,
 }
 
 impl Subscription {
     /// Wraps whatever undeclares the subscription on drop.
-    pub fn new(guard: impl std::any::Any + Send) -> Self {
+    pub fn new(guard: impl std::any::Any + Send + Sync) -> Self {
         Self { _guard: Box::new(guard) }
     }
 }

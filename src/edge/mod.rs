@@ -5,4 +5,13 @@
 //! Deliberately absent: mathematics.
 
 pub mod bus;
+pub mod config;
+pub mod files;
+pub mod inlet;
+pub mod outlet;
+pub mod replay;
+pub mod scoreboard;
+pub mod settings;
+pub mod synthetic;
 pub mod wire;
+pub mod zenoh;

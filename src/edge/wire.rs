@@ -14,8 +14,8 @@
 //! | `status` | [`Status`] | |
 //! | `event` | [`Event`] | |
 //!
-//! Each `out` key has a twin `KEY/json`. The JSON holds the same content, arranged by name; numbers that JSON
-//! cannot hold (NaN) are `null`. The arrays are described in the types.
+//! Each `out` key has a twin `KEY/json`. The JSON holds the same content, arranged by name (`names` keeps the order);
+//! numbers that JSON cannot hold (NaN, infinities) are `null`. The arrays are described in the types.
 
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use serde_json::{Map, Value, json};
@@ -48,7 +48,7 @@ pub struct PressureBlock {
     pub flags: u32,
     /// Event time of the first sample \[ns\].
     pub start_ns: i64,
-    /// Spacing \[ns\]; 0 if `offsets_ns` tells the times.
+    /// Spacing \[ns\]; 0 if `offsets_ns` tells the times (or there is one sample). Telling both is malformed.
     pub period_ns: i64,
     /// Time of each sample after `start_ns` \[ns\]; empty if `period_ns` tells the times.
     #[serde(default)]
@@ -120,7 +120,7 @@ pub struct ChannelStatus {
     pub name: String,
     /// `live`, `silent` or `never`.
     pub state: String,
-    /// Event time of its last sample \[ns\].
+    /// Event time of its last sample \[ns\]; 0 if there was none.
     pub last_sample_ns: i64,
     /// Samples that entered the estimate.
     pub samples_used: u64,
@@ -210,7 +210,10 @@ fn bincode_config() -> impl bincode::config::Config {
 /// # Errors
 /// When the message is longer than [`MAX_PAYLOAD_BYTES`].
 pub fn encode<T: Serialize>(message: &T) -> Result<Vec<u8>, WireError> {
-    bincode::serde::encode_to_vec(message, bincode_config()).map_err(|e| WireError::Malformed(e.to_string()))
+    let bytes = bincode::serde::encode_to_vec(message, bincode_config());
+    let bytes = bytes.map_err(|e| WireError::Malformed(e.to_string()))?;
+    // Bincode's own limit binds readers only.
+    if bytes.len() > MAX_PAYLOAD_BYTES { Err(WireError::TooLong(bytes.len())) } else { Ok(bytes) }
 }
 
 /// Reads a message of this module; the schema version is looked at before anything else.
@@ -282,7 +285,8 @@ impl ToJson for StateEstimate {
     fn to_json(&self) -> Value {
         let (n, k) = (self.names.len(), STATE_STATISTICS.len());
         let quantity = |q: usize| -> Value {
-            let series = |s: usize| (0..self.times_ns.len()).map(|t| self.values[(t * n + q) * k + s]).collect();
+            let value = |t: usize, s: usize| self.values.get((t * n + q) * k + s).copied().unwrap_or(f64::NAN);
+            let series = |s: usize| (0..self.times_ns.len()).map(|t| value(t, s)).collect();
             STATE_STATISTICS.iter().enumerate().map(|(s, name)| (*name, series(s))).collect::<Series>().into()
         };
         let quantities: Map<String, Value> =
@@ -291,7 +295,7 @@ impl ToJson for StateEstimate {
             &self.header,
             json!({
                 "members": self.members, "times_ns": self.times_ns, "since_data_s": self.since_data_s,
-                "quantities": quantities,
+                "names": self.names, "quantities": quantities,
             }),
         )
     }
@@ -317,12 +321,12 @@ impl ToJson for ParameterEstimate {
     fn to_json(&self) -> Value {
         let k = PARAMETER_STATISTICS.len();
         let parameter = |p: usize| -> Map<String, Value> {
-            let row = &self.values[p * k..(p + 1) * k];
-            PARAMETER_STATISTICS.iter().zip(row).map(|(name, value)| ((*name).to_owned(), json!(value))).collect()
+            let value = |s: usize| self.values.get(p * k + s).copied().unwrap_or(f64::NAN);
+            PARAMETER_STATISTICS.iter().enumerate().map(|(s, name)| ((*name).to_owned(), json!(value(s)))).collect()
         };
         let parameters: Map<String, Value> =
             self.names.iter().enumerate().map(|(p, name)| (name.clone(), Value::Object(parameter(p)))).collect();
-        with_header(&self.header, json!({ "members": self.members, "parameters": parameters }))
+        with_header(&self.header, json!({ "members": self.members, "names": self.names, "parameters": parameters }))
     }
 }
 
@@ -354,6 +358,6 @@ impl ToJson for Truth {
     fn to_json(&self) -> Value {
         let values: Map<String, Value> =
             self.names.iter().zip(&self.values).map(|(name, value)| (name.clone(), json!(value))).collect();
-        json!({ "schema": self.schema, "time_ns": self.time_ns, "values": values })
+        json!({ "schema": self.schema, "time_ns": self.time_ns, "names": self.names, "values": values })
     }
 }

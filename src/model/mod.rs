@@ -10,7 +10,7 @@
 //! # How to add a model
 //!
 //! One file: equations, parameter table with units, citation, then the code row by row.
-//! 1. Declare states, parameters and derived quantities with [`named_vector!`] and a [`ParameterInfo`] table.
+//! 1. Declare states, parameters and derived quantities with [`crate::named_vector!`] and a [`ParameterInfo`] table.
 //! 2. Implement [`Model`]; time-dependent forcing goes through a *clock parameter* ([`Model::advance`]).
 //! 3. Add the model to the Jacobian property test in `tests/it/model.rs`.
 

@@ -124,6 +124,14 @@ impl<M: Model> Simulator<M> {
         out
     }
 
+    /// Gives a parameter a new value from now on.
+    pub fn assign(&mut self, parameter: usize, value: f64) {
+        self.theta[parameter] = value;
+        // What was integrated ahead is no longer true.
+        let now = Step { t: 0.0, x: self.x.clone(), dx: vec![0.0; self.x.len()] };
+        self.segment = Segment { start_s: self.time_s, end_s: self.time_s, theta: self.theta.clone(), steps: vec![now] };
+    }
+
     /// Integrates to `time_s`; does nothing if that is not in the future.
     ///
     /// # Errors

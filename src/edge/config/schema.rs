@@ -1,0 +1,346 @@
+//! What can be set, with the built-in defaults. Ranges are in [`super::check`], prose for users is in
+//! `config/default.toml`.
+//!
+//! No field has a serde default: what a file leaves out comes from the layer below, and the lowest layer is
+//! `Config::default()`. So every default is written once.
+
+use std::collections::BTreeMap;
+
+use serde::de::{Deserializer, Error, IntoDeserializer};
+use serde::{Deserialize, Serialize};
+
+use super::patient::Patient;
+use crate::model::cvsim6::Pressures;
+
+/// The effective configuration. See [`Config::load`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// Names of the states whose sensors are believed; other channels are received and ignored.
+    pub observed: Vec<String>,
+    /// The patient: parameters of the model, start, script.
+    pub patient: Patient,
+    /// What is estimated and how.
+    pub estimator: EstimatorSettings,
+    /// The subdomain of X-TFC and its network.
+    pub window: WindowSettings,
+    /// The sensor of each state.
+    pub channels: PerState<ChannelSettings>,
+    /// Channel names of monitors, and the state each of them measures.
+    pub labels: BTreeMap<String, String>,
+    /// What is published, where and how often.
+    pub publish: PublishSettings,
+    /// Limits of the daemon.
+    pub service: ServiceSettings,
+    /// The network.
+    pub zenoh: ZenohSettings,
+}
+
+/// One value per state.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PerState<T> {
+    /// Left ventricle.
+    pub p_l: T,
+    /// Systemic arteries.
+    pub p_a: T,
+    /// Systemic veins.
+    pub p_v: T,
+    /// Right ventricle.
+    pub p_r: T,
+    /// Pulmonary arteries.
+    pub p_pa: T,
+    /// Pulmonary veins.
+    pub p_pv: T,
+}
+
+impl<T> PerState<T> {
+    /// Names and values in the order of the states.
+    pub fn iter(&self) -> impl Iterator<Item = (&'static str, &T)> {
+        let values = [&self.p_l, &self.p_a, &self.p_v, &self.p_r, &self.p_pa, &self.p_pv];
+        Pressures::NAMES.iter().copied().zip(values)
+    }
+
+    /// The value of the state called `name`.
+    #[must_use]
+    pub fn get(&self, name: &str) -> Option<&T> {
+        self.iter().find(|(state, _)| *state == name).map(|(_, value)| value)
+    }
+}
+
+/// `[estimator]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EstimatorSettings {
+    /// How data enter the solve.
+    #[serde(deserialize_with = "by_name")]
+    pub coupling: Coupling,
+    /// Names of the estimated parameters.
+    pub estimate: Vec<String>,
+    /// Centre of the starting spread, each in the unit of its parameter; the patient's value where left out.
+    pub initial_guess: BTreeMap<String, f64>,
+    /// Relative standard deviation of the starting spread of every estimated parameter.
+    pub initial_guess_sd: f64,
+    /// Monte Carlo members.
+    pub members: usize,
+    /// Seed of every random number.
+    pub seed: u64,
+    /// Relative random walk of the estimated parameters \[1/sqrt(s)\].
+    pub parameter_drift: f64,
+    /// Process noise of the pressures \[mmHg/sqrt(s)\].
+    pub pressure_drift: f64,
+    /// Factor by which the spread grows in one second.
+    pub inflation: f64,
+    /// Gauss-Newton iterations of one window.
+    pub max_iterations: usize,
+    /// Error of the pressures left by the linearisation at which iterations stop \[mmHg\].
+    pub tolerance: f64,
+}
+
+/// How data enter the solve.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Coupling {
+    /// Members share what the data say through the covariance of the ensemble.
+    #[default]
+    Coupled,
+    /// Every member fits its own perturbed data, as in the paper.
+    Independent,
+}
+
+/// `[window]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WindowSettings {
+    /// Length of a subdomain \[s\].
+    pub length_s: f64,
+    /// How long a window waits for late samples, in event time \[s\].
+    pub allowed_lateness_s: f64,
+    /// Longest gap bridged by forecasts \[s\].
+    pub forecast_limit_s: f64,
+    /// Points per window at which the physics is enforced.
+    pub collocation_points: usize,
+    /// Where those points lie.
+    #[serde(deserialize_with = "by_name")]
+    pub nodes: Nodes,
+    /// Random features per state.
+    pub neurons: usize,
+    /// Their nonlinearity.
+    #[serde(deserialize_with = "by_name")]
+    pub activation: Activation,
+    /// Distribution of the input weights.
+    pub weights: Distribution,
+    /// Distribution of the biases.
+    pub biases: Distribution,
+    /// Interval to which a window is mapped before it enters the network.
+    #[serde(deserialize_with = "pair")]
+    pub domain: [f64; 2],
+    /// Weight of the physics rows.
+    pub physics_weight: f64,
+    /// Weight of the data rows of [`Coupling::Independent`], which are in mmHg.
+    pub data_weight: f64,
+    /// Weight that holds the parameters of [`Coupling::Independent`] to their last value (`w_theta`).
+    pub parameter_weight: f64,
+}
+
+/// Where collocation points lie.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Nodes {
+    /// Equidistant, both ends included.
+    #[default]
+    Uniform,
+    /// Chebyshev-Gauss-Lobatto.
+    Chebyshev,
+    /// Legendre-Gauss-Lobatto.
+    Legendre,
+}
+
+/// Nonlinearity of the random features.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[expect(missing_docs, reason = "the names are the documentation")]
+pub enum Activation {
+    #[default]
+    Tanh,
+    Logistic,
+    Sine,
+    Arctan,
+    Softplus,
+    Swish,
+}
+
+/// A distribution of random weights: exactly one of these keys.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Distribution {
+    /// Between two ends.
+    #[serde(deserialize_with = "pair")]
+    Uniform([f64; 2]),
+    /// Mean and standard deviation.
+    #[serde(deserialize_with = "pair")]
+    Normal([f64; 2]),
+    /// Mean.
+    Exponential(f64),
+}
+
+/// `[channels.STATE]`
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ChannelSettings {
+    /// Standard deviation of the sensor noise \[mmHg\].
+    pub noise_sd: f64,
+    /// Samples below are refused as implausible \[mmHg\].
+    pub min_mmhg: f64,
+    /// Samples above are refused as implausible \[mmHg\].
+    pub max_mmhg: f64,
+}
+
+/// `[publish]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PublishSettings {
+    /// First chunks of every topic.
+    pub prefix: String,
+    /// State estimates per second and bed \[Hz\].
+    pub rate_hz: f64,
+    /// Whether every topic has a JSON twin.
+    pub json: bool,
+    /// Status messages per second and bed \[Hz\].
+    pub status_rate_hz: f64,
+}
+
+/// `[service]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ServiceSettings {
+    /// Threads that solve windows; 0 for one per core.
+    pub workers: usize,
+    /// Beds served at the same time.
+    pub max_beds: usize,
+    /// Blocks of samples queued per bed.
+    pub queue_blocks: usize,
+}
+
+/// `[zenoh]`
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ZenohSettings {
+    /// Role in the network.
+    #[serde(deserialize_with = "by_name")]
+    pub mode: ZenohMode,
+    /// Endpoints on which connections are accepted.
+    pub listen: Vec<String>,
+    /// Endpoints to which connections are made.
+    pub connect: Vec<String>,
+}
+
+/// Role in the zenoh network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[expect(missing_docs, reason = "zenoh's own words")]
+pub enum ZenohMode {
+    #[default]
+    Peer,
+    Client,
+    Router,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        let labels = [
+            ("ABP", "p_a"),
+            ("ART", "p_a"),
+            ("AOBP", "p_a"),
+            ("UAP", "p_a"),
+            ("PAP", "p_pa"),
+            ("CVP", "p_v"),
+            ("LAP", "p_pv"),
+            ("RVP", "p_r"),
+            ("LVP", "p_l"),
+        ];
+        Self {
+            observed: Pressures::NAMES.iter().map(|&name| name.to_owned()).collect(),
+            patient: Patient::default(),
+            estimator: EstimatorSettings::default(),
+            window: WindowSettings::default(),
+            channels: default_channels(),
+            labels: labels.map(|(label, state)| (label.to_owned(), state.to_owned())).into(),
+            publish: PublishSettings {
+                prefix: "hemostream".to_owned(),
+                rate_hz: 50.0,
+                json: true,
+                status_rate_hz: 1.0,
+            },
+            service: ServiceSettings { workers: 0, max_beds: 256, queue_blocks: 1024 },
+            zenoh: ZenohSettings {
+                mode: ZenohMode::Peer,
+                listen: vec!["tcp/127.0.0.1:7447".to_owned()],
+                connect: Vec::new(),
+            },
+        }
+    }
+}
+
+impl Default for EstimatorSettings {
+    fn default() -> Self {
+        Self {
+            coupling: Coupling::Coupled,
+            estimate: vec!["r_pv".to_owned(), "c_a".to_owned()],
+            initial_guess: BTreeMap::new(),
+            initial_guess_sd: 0.3,
+            members: 100,
+            seed: 1,
+            parameter_drift: 0.02,
+            pressure_drift: 0.01,
+            inflation: 1.0,
+            max_iterations: 20,
+            tolerance: 1e-9,
+        }
+    }
+}
+
+impl Default for WindowSettings {
+    fn default() -> Self {
+        Self {
+            length_s: 0.002,
+            allowed_lateness_s: 0.2,
+            forecast_limit_s: 10.0,
+            collocation_points: 5,
+            nodes: Nodes::Legendre,
+            neurons: 5,
+            activation: Activation::Tanh,
+            weights: Distribution::Uniform([-1.0, 1.0]),
+            biases: Distribution::Uniform([-1.0, 1.0]),
+            domain: [0.0, 1.0],
+            physics_weight: 1.0,
+            data_weight: 1.0,
+            parameter_weight: 10.0,
+        }
+    }
+}
+
+/// Noise of 2 % of the maximum pressures in the paper.
+fn default_channels() -> PerState<ChannelSettings> {
+    let noise = |noise_sd| ChannelSettings { noise_sd, min_mmhg: -50.0, max_mmhg: 350.0 };
+    PerState {
+        p_l: noise(2.07),
+        p_a: noise(2.06),
+        p_v: noise(0.146),
+        p_r: noise(0.408),
+        p_pa: noise(0.40),
+        p_pv: noise(0.242),
+    }
+}
+
+/// Reads an enum from its name only: figment would also take a number as the position of a variant.
+pub(super) fn by_name<'de, D: Deserializer<'de>, T: Deserialize<'de>>(deserializer: D) -> Result<T, D::Error> {
+    let name = String::deserialize(deserializer)?;
+    T::deserialize(name.into_deserializer())
+}
+
+/// Reads two numbers and no more: figment would ignore the rest of a longer list.
+fn pair<'de, D: Deserializer<'de>>(deserializer: D) -> Result<[f64; 2], D::Error> {
+    let numbers = Vec::deserialize(deserializer)?;
+    numbers.try_into().map_err(|longer: Vec<f64>| D::Error::invalid_length(longer.len(), &"two numbers"))
+}

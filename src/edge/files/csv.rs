@@ -1,0 +1,244 @@
+//! CSV: records of samples in, truth, observations and estimates out.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use crate::edge::config::Config;
+use crate::estimate::ensemble::ParameterSummary;
+use crate::estimate::estimator::Estimate;
+use crate::estimate::statistics::Summary;
+use crate::estimate::time::EventTime;
+use crate::model::Model;
+use crate::model::cvsim6::{Cvsim6, Pressures};
+
+/// A record or table that cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum CsvError {
+    /// Opening, reading or writing failed.
+    #[error("{path}: {reason}")]
+    File {
+        /// Which file.
+        path: PathBuf,
+        /// What the system said.
+        reason: String,
+    },
+    /// The content is not a record.
+    #[error("{path}{}: found {found}, expected {expected}", line.map_or_else(String::new, |l| format!(":{l}")))]
+    Content {
+        /// Which file.
+        path: PathBuf,
+        /// Line, counted from 1.
+        line: Option<u64>,
+        /// What is there.
+        found: String,
+        /// What should be.
+        expected: String,
+    },
+}
+
+/// One row of a record.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Row {
+    /// When.
+    pub time: EventTime,
+    /// A sample per column of [`RecordReader::states`], where there is one.
+    pub values: Vec<Option<f64>>,
+}
+
+/// Reads a record row by row: `time_s` and any of the six pressures by name or by monitor label.
+pub struct RecordReader {
+    path: PathBuf,
+    reader: csv::Reader<File>,
+    record: csv::StringRecord,
+    time_column: usize,
+    /// State of each other column, in the order of the file.
+    states: Vec<usize>,
+    headers: Vec<String>,
+    last: Option<EventTime>,
+}
+
+impl RecordReader {
+    /// Opens a record and checks its header.
+    ///
+    /// # Errors
+    /// When the file cannot be read, is empty, has no `time_s`, or a column that is no pressure.
+    pub fn open(path: &Path, config: &Config) -> Result<Self, CsvError> {
+        let file = File::open(path).map_err(|e| file_error(path, &e))?;
+        let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(file);
+        let headers: Vec<String> = reader
+            .headers()
+            .map_err(|e| content(path, Some(1), e.to_string(), "a CSV header"))?
+            .iter()
+            .map(str::to_owned)
+            .collect();
+        if headers.is_empty() {
+            return Err(content(path, None, "an empty file", "a CSV header with `time_s` and pressures"));
+        }
+        let Some(time_column) = headers.iter().position(|h| h == "time_s") else {
+            let found = format!("columns {}", headers.join(", "));
+            return Err(content(path, Some(1), found, "a column `time_s` [s]"));
+        };
+        let mut states = Vec::new();
+        for header in headers.iter().filter(|h| *h != "time_s") {
+            let state = config.state_of_label(header);
+            let Some(index) = Pressures::NAMES.iter().position(|name| Some(*name) == state) else {
+                let names = Pressures::NAMES.join(", ");
+                let expected = format!("a pressure ({names}) or a label of the table [labels]");
+                return Err(content(path, Some(1), format!("column `{header}`"), &expected));
+            };
+            if states.contains(&index) {
+                let found = format!("column `{header}`, a second one for {}", Pressures::NAMES[index]);
+                return Err(content(path, Some(1), found, "one column per pressure"));
+            }
+            states.push(index);
+        }
+        if headers.iter().filter(|h| *h == "time_s").count() > 1 {
+            return Err(content(path, Some(1), "two columns `time_s`", "one"));
+        }
+        if states.is_empty() {
+            return Err(content(path, Some(1), "no column but `time_s`", "at least one pressure"));
+        }
+        let record = csv::StringRecord::new();
+        Ok(Self { path: path.to_owned(), reader, record, time_column, states, headers, last: None })
+    }
+
+    /// The state that each value of a row belongs to.
+    #[must_use]
+    pub fn states(&self) -> &[usize] {
+        &self.states
+    }
+
+    /// The next row; None at the end.
+    ///
+    /// # Errors
+    /// When a cell is not a number, or time does not increase.
+    pub fn next_row(&mut self) -> Result<Option<Row>, CsvError> {
+        let more = self.reader.read_record(&mut self.record);
+        let line = self.record.position().map(csv::Position::line);
+        if !more.map_err(|e| content(&self.path, e.position().map(csv::Position::line), e.to_string(), "a row like the header"))? {
+            if self.last.is_none() {
+                return Err(content(&self.path, None, "no row", "at least one sample"));
+            }
+            return Ok(None);
+        }
+        let mut time = None;
+        let mut values = Vec::with_capacity(self.states.len());
+        for (column, cell) in self.record.iter().enumerate() {
+            if column == self.time_column {
+                time = Some(EventTime::from_s(self.number(cell, column, line)?));
+            } else if cell.is_empty() {
+                values.push(None);
+            } else {
+                values.push(Some(self.number(cell, column, line)?));
+            }
+        }
+        let Some(time) = time else { return Err(content(&self.path, line, "no time", "a number in `time_s`")) };
+        if let Some(last) = self.last.filter(|last| *last >= time) {
+            let found = format!("time_s {} after {}", time.as_s(), last.as_s());
+            return Err(content(&self.path, line, found, "strictly increasing times"));
+        }
+        self.last = Some(time);
+        Ok(Some(Row { time, values }))
+    }
+
+    fn number(&self, cell: &str, column: usize, line: Option<u64>) -> Result<f64, CsvError> {
+        let value = cell.parse::<f64>().ok().filter(|v| column != self.time_column || v.is_finite());
+        value.ok_or_else(|| {
+            let found = format!("`{cell}` in column `{}`", self.headers.get(column).map_or("", String::as_str));
+            let empty = if column == self.time_column { "a number" } else { "a number, or nothing for a missing sample" };
+            content(&self.path, line, found, empty)
+        })
+    }
+}
+
+fn file_error(path: &Path, error: &dyn std::fmt::Display) -> CsvError {
+    CsvError::File { path: path.to_owned(), reason: error.to_string() }
+}
+
+fn content(path: &Path, line: Option<u64>, found: impl Into<String>, expected: &str) -> CsvError {
+    CsvError::Content { path: path.to_owned(), line, found: found.into(), expected: expected.to_owned() }
+}
+
+/// Writes rows of numbers under a header. Numbers are written so that they read back exactly.
+pub struct TableWriter {
+    path: PathBuf,
+    writer: BufWriter<File>,
+    columns: usize,
+}
+
+impl TableWriter {
+    /// Creates the file and writes the header.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn create(path: &Path, header: &[String]) -> Result<Self, CsvError> {
+        let file = File::create(path).map_err(|e| file_error(path, &e))?;
+        let mut table = Self { path: path.to_owned(), writer: BufWriter::new(file), columns: header.len() };
+        table.line(header.iter().map(String::as_str))?;
+        Ok(table)
+    }
+
+    /// Writes a row; NaN becomes an empty cell.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn row(&mut self, values: &[f64]) -> Result<(), CsvError> {
+        debug_assert_eq!(values.len(), self.columns, "a row has as many cells as the header");
+        let cell = |v: &f64| if v.is_nan() { String::new() } else { v.to_string() };
+        self.line(values.iter().map(cell))
+    }
+
+    fn line(&mut self, cells: impl Iterator<Item = impl AsRef<str>>) -> Result<(), CsvError> {
+        let mut line = String::new();
+        for (i, cell) in cells.enumerate() {
+            if i > 0 {
+                line.push(',');
+            }
+            line.push_str(cell.as_ref());
+        }
+        line.push('\n');
+        self.writer.write_all(line.as_bytes()).map_err(|e| file_error(&self.path, &e))
+    }
+
+    /// Writes what is buffered.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn finish(mut self) -> Result<(), CsvError> {
+        self.writer.flush().map_err(|e| file_error(&self.path, &e))
+    }
+}
+
+/// Header of an estimate file: `time_s`, seven statistics per quantity, four per parameter.
+#[must_use]
+pub fn estimate_header(model: Cvsim6, estimated: &[usize]) -> Vec<String> {
+    let quantities = model.states().iter().chain(model.derived()).flat_map(|q| {
+        ["mean", "sd", "q05", "q95", "epistemic_sd", "aleatoric_sd", "model_sd"].map(|s| format!("{}_{s}", q.name))
+    });
+    let name = |p: &usize| model.parameters()[*p].name;
+    let parameters = estimated.iter().flat_map(|p| ["mean", "sd", "q05", "q95"].map(|s| format!("{}_{s}", name(p))));
+    std::iter::once("time_s".to_owned()).chain(quantities).chain(parameters).collect()
+}
+
+/// A row of an estimate file.
+#[must_use]
+pub fn estimate_row(estimate: &Estimate) -> Vec<f64> {
+    let quantity = |s: &Summary| [s.mean, s.sd, s.q05, s.q95, s.epistemic_sd, s.aleatoric_sd, s.model_sd];
+    let parameter = |(p, _): &(ParameterSummary, i64)| {
+        let s = &p.summary;
+        [s.mean, s.sd, s.q05, s.q95]
+    };
+    std::iter::once(estimate.time.as_s())
+        .chain(estimate.quantities.iter().flat_map(quantity))
+        .chain(estimate.parameters.iter().flat_map(parameter))
+        .collect()
+}
+
+/// Header of a truth file: `time_s`, pressures, flows, volumes, and the parameters that change.
+#[must_use]
+pub fn truth_header(model: Cvsim6, changing: &[usize]) -> Vec<String> {
+    let quantities = model.states().iter().chain(model.derived()).map(|q| q.name);
+    let parameters = changing.iter().map(|&p| model.parameters()[p].name);
+    std::iter::once("time_s").chain(quantities).chain(parameters).map(str::to_owned).collect()
+}

@@ -1,0 +1,112 @@
+//! From topics to tasks: samples are decoded and named here, and whatever is not understood becomes a counted
+//! refusal of the bed it was sent to.
+
+use std::sync::Arc;
+
+use super::bus::{Bus, BusError, Message, Subscription};
+use super::config::Config;
+use super::wire::{FLAG_LAST_BLOCK, PressureBlock, WireError, decode};
+use crate::estimate::time::EventTime;
+use crate::estimate::window::RawSample;
+use crate::model::Model;
+use crate::runtime::bed::Task;
+use crate::runtime::service::{Event, Inlet};
+
+/// Samples accepted in one block.
+const MAX_BLOCK_SAMPLES: usize = 16_384;
+
+/// Knows which label is which channel.
+struct Decoder {
+    prefix: String,
+    /// Label and index of the channel.
+    labels: Vec<(String, usize)>,
+    /// Labels of states that are known but not listened to.
+    ignored: Vec<String>,
+}
+
+impl Decoder {
+    fn new(config: &Config) -> Self {
+        let model = config.patient.model();
+        let states: Vec<&str> = model.states().iter().map(|q| q.name).collect();
+        let channels: Vec<&str> =
+            states.iter().copied().filter(|name| config.observed.iter().any(|o| o == name)).collect();
+        let names = states.iter().map(|name| (*name).to_owned()).chain(config.labels.keys().cloned());
+        let (mut labels, mut ignored) = (Vec::new(), Vec::new());
+        for label in names {
+            let state = config.state_of_label(&label).map(str::to_owned);
+            match channels.iter().position(|c| Some(*c) == state.as_deref()) {
+                Some(channel) => labels.push((label, channel)),
+                None => ignored.push(label),
+            }
+        }
+        Self { prefix: config.publish.prefix.clone(), labels, ignored }
+    }
+
+    /// The bed and what to do; None for what is not meant for this service.
+    fn event(&self, message: &Message) -> Option<Event> {
+        let rest = message.key.strip_prefix(&self.prefix)?.strip_prefix('/')?;
+        let (bed, channel) = rest.split_once("/pressure/")?;
+        if self.ignored.iter().any(|label| label == channel) {
+            return None;
+        }
+        let task = match self.labels.iter().find(|(label, _)| label == channel) {
+            None => Task::Refused("unknown_channel"),
+            Some((_, channel)) => task(message, *channel).unwrap_or_else(Task::Refused),
+        };
+        Some(Event::Task { bed: bed.to_owned(), task })
+    }
+}
+
+fn task(message: &Message, channel: usize) -> Result<Task, &'static str> {
+    let block: PressureBlock = decode(&message.payload, message.encoding).map_err(|error| match error {
+        WireError::TooLong(_) => "oversized",
+        WireError::Malformed(_) => "malformed",
+        WireError::Schema(_) => "wrong_schema",
+    })?;
+    if block.values.len() > MAX_BLOCK_SAMPLES {
+        return Err("oversized");
+    }
+    let last = block.flags & FLAG_LAST_BLOCK != 0;
+    let samples = samples(&block).ok_or("malformed")?;
+    Ok(Task::Samples { channel, sequence: block.sequence, last, samples })
+}
+
+/// Samples with their times; None if the block does not say when they were taken.
+fn samples(block: &PressureBlock) -> Option<Vec<RawSample>> {
+    let explicit = block.period_ns == 0;
+    if explicit && block.values.len() > 1 && block.offsets_ns.len() != block.values.len() {
+        return None;
+    }
+    if block.period_ns < 0 || (!explicit && !block.offsets_ns.is_empty()) {
+        return None;
+    }
+    let offset = |i: usize| -> Option<i64> {
+        if explicit {
+            Some(block.offsets_ns.get(i).copied().unwrap_or(0))
+        } else {
+            block.period_ns.checked_mul(i64::try_from(i).ok()?)
+        }
+    };
+    let sample = |(i, value): (usize, &f64)| {
+        let time = EventTime(block.start_ns.checked_add(offset(i)?)?);
+        Some(RawSample { time, value: *value })
+    };
+    block.values.iter().enumerate().map(sample).collect()
+}
+
+/// Listens to the pressures of all beds.
+///
+/// # Errors
+/// When the bus does not take the subscription.
+pub fn listen(bus: &dyn Bus, config: &Config, inlet: Inlet) -> Result<Subscription, BusError> {
+    let decoder = Decoder::new(config);
+    let pattern = format!("{}/*/pressure/*", config.publish.prefix);
+    bus.subscribe(
+        &pattern,
+        Arc::new(move |message| {
+            if let Some(event) = decoder.event(&message) {
+                inlet.offer(event);
+            }
+        }),
+    )
+}

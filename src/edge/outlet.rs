@@ -1,0 +1,333 @@
+//! From outputs to topics: encoding, sequence numbers, last values for late joiners.
+//!
+//! Workers encode and hand over to one publishing thread through a bounded queue; estimates that do not fit are
+//! dropped and counted, events wait. JSON twins are made only while somebody subscribes to them.
+
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use super::bus::{self, Bus, BusError, Delivery, Encoding, Message, Subscription};
+use super::config::Config;
+use super::wire::{
+    self, ChannelStatus, Event, Header, Members, ParameterEstimate, SCHEMA, StateEstimate, Status, ToJson,
+};
+use crate::estimate::estimator::{Estimate, Notice, Output};
+use crate::estimate::statistics::Summary;
+use crate::estimate::time::{EventTime, s_from_ns};
+use crate::estimate::window::Liveness;
+use crate::model::Model;
+use crate::model::cvsim6::Cvsim6;
+use crate::runtime::bed::{Bed, Health};
+use crate::runtime::service::Sink;
+
+/// Messages that may wait for the publishing thread.
+const QUEUE: usize = 4096;
+
+/// Keys whose last value is kept.
+const MAX_LAST_VALUES: usize = 65_536;
+
+type LastStore = Arc<Mutex<HashMap<String, Vec<u8>>>>;
+
+/// Publishes what beds put out.
+pub struct Outlet {
+    bus: Arc<dyn Bus>,
+    prefix: String,
+    seed: u64,
+    config_hash: u64,
+    json: bool,
+    model: Cvsim6,
+    queue: Option<SyncSender<(Message, Delivery)>>,
+    dropped: AtomicU64,
+    last: LastStore,
+    sequences: Mutex<HashMap<String, u64>>,
+    thread: Option<std::thread::JoinHandle<()>>,
+    _answers: Subscription,
+}
+
+impl Outlet {
+    /// Starts the publishing thread and offers last values.
+    ///
+    /// # Errors
+    /// When the bus does not take the offer.
+    pub fn start(bus: Arc<dyn Bus>, config: &Config) -> Result<Self, BusError> {
+        let last = LastStore::default();
+        let offered = Arc::clone(&last);
+        // Keys of this service only; the pattern must not answer for the pressures.
+        let pattern = format!("{}/**", config.publish.prefix);
+        let answers = bus.offer_last_values(&pattern, Arc::new(move |asked| answer(&offered, asked)))?;
+        let (queue, waiting) = sync_channel(QUEUE);
+        let publisher = Arc::clone(&bus);
+        let thread = std::thread::Builder::new()
+            .name("publish".to_owned())
+            .spawn(move || publish_all(publisher.as_ref(), &waiting))
+            .map_err(|e| BusError::Transport(e.to_string()))?;
+        Ok(Self {
+            bus,
+            prefix: config.publish.prefix.clone(),
+            seed: config.estimator.seed,
+            config_hash: config.hash(),
+            json: config.publish.json,
+            model: config.patient.model(),
+            queue: Some(queue),
+            dropped: AtomicU64::new(0),
+            last,
+            sequences: Mutex::default(),
+            thread: Some(thread),
+            _answers: answers,
+        })
+    }
+
+    fn header(&self, key: &str, time: EventTime) -> Header {
+        let mut sequences = self.sequences.lock().unwrap_or_else(PoisonError::into_inner);
+        let next = match sequences.get_mut(key) {
+            Some(next) => next,
+            None => sequences.entry(key.to_owned()).or_default(),
+        };
+        let sequence = *next;
+        *next += 1;
+        Header { schema: SCHEMA, seed: self.seed, config_hash: self.config_hash, sequence, time_ns: time.0 }
+    }
+
+    fn key(&self, bed: &str, topic: &str) -> String {
+        format!("{}/{bed}/{topic}", self.prefix)
+    }
+
+    /// Encodes, remembers and queues a message, and its JSON twin if somebody wants it.
+    fn send<T: Serialize + ToJson>(&self, key: String, message: &T, delivery: Delivery) {
+        let Ok(payload) = wire::encode(message) else {
+            self.dropped.fetch_add(1, Ordering::Relaxed);
+            return;
+        };
+        {
+            let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Some(value) = last.get_mut(&key) {
+                value.clone_from(&payload);
+            } else if last.len() < MAX_LAST_VALUES {
+                last.insert(key.clone(), payload.clone());
+            }
+        }
+        let twin = format!("{key}/json");
+        if self.json && self.bus.is_wanted(&twin) {
+            let payload = message.to_json().to_string().into_bytes();
+            self.queue(Message { key: twin, encoding: Encoding::Json, payload }, delivery);
+        }
+        self.queue(Message { key, encoding: Encoding::Bincode, payload }, delivery);
+    }
+
+    fn queue(&self, message: Message, delivery: Delivery) {
+        let Some(queue) = &self.queue else { return };
+        let lost = match delivery {
+            Delivery::Events => queue.send((message, delivery)).is_err(),
+            Delivery::Samples | Delivery::Estimates => {
+                matches!(queue.try_send((message, delivery)), Err(TrySendError::Full(_) | TrySendError::Disconnected(_)))
+            }
+        };
+        if lost {
+            self.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    fn estimate(&self, bed: &Bed, estimate: &Estimate) {
+        let key = self.key(&bed.name, "estimate/state");
+        let header = self.header(&key, estimate.time);
+        self.send(key, &state_message(header, self.model, estimate), Delivery::Estimates);
+
+        let key = self.key(&bed.name, "estimate/parameters");
+        let header = self.header(&key, estimate.time);
+        self.send(key, &parameter_message(header, self.model, estimate), Delivery::Estimates);
+
+        if let Some(values) = &estimate.ensemble {
+            let key = self.key(&bed.name, "estimate/members");
+            let header = self.header(&key, estimate.time);
+            let parameters = estimate.parameters.iter().map(|(p, _)| self.model.parameters()[p.parameter].name);
+            let names = self.model.states().iter().map(|q| q.name).chain(parameters).map(str::to_owned).collect();
+            self.send(key, &Members { header, names, values: values.clone() }, Delivery::Estimates);
+        }
+    }
+
+    fn notice(&self, bed: &str, channels: &[&str], notice: &Notice) {
+        let channel = notice.channel.and_then(|c| channels.get(c)).copied().unwrap_or_default();
+        let (kind, text) = (notice.kind.name(), notice.kind.text());
+        tracing::info!(bed, kind, channel, time_s = notice.time.as_s(), "{text}");
+        let key = self.key(bed, "event");
+        let header = self.header(&key, notice.time);
+        let event = Event { header, kind: kind.to_owned(), channel: channel.to_owned(), text };
+        self.send(key, &event, Delivery::Events);
+    }
+
+    fn status(&self, bed: &Bed, health: &Health) {
+        let key = self.key(&bed.name, "status");
+        let header = self.header(&key, health.time);
+        let mut status = status_message(header, self.model, health);
+        let dropped = self.dropped.load(Ordering::Relaxed);
+        if dropped > 0 {
+            status.counters.push(("publish_dropped".to_owned(), dropped));
+        }
+        self.send(key, &status, Delivery::Estimates);
+    }
+}
+
+impl Sink for Outlet {
+    fn put(&self, bed: &Bed, outputs: &[Output], health: Option<&Health>) {
+        let channels: Vec<&str> = bed
+            .estimator()
+            .settings()
+            .channels
+            .iter()
+            .map(|c| self.model.states().get(c.state).map_or("", |q| q.name))
+            .collect();
+        for output in outputs {
+            match output {
+                Output::Estimate(estimate) => self.estimate(bed, estimate),
+                Output::Notice(notice) => self.notice(&bed.name, &channels, notice),
+                Output::Window(_) => {}
+            }
+        }
+        if let Some(health) = health {
+            self.status(bed, health);
+        }
+    }
+
+    fn wants_members(&self, bed: &str) -> bool {
+        let key = self.key(bed, "estimate/members");
+        self.bus.is_wanted(&key) || (self.json && self.bus.is_wanted(&format!("{key}/json")))
+    }
+
+    fn lost(&self, bed: &str) {
+        tracing::error!(bed, "the bed was lost to a defect in the program and starts anew");
+        let key = self.key(bed, "event");
+        let header = self.header(&key, EventTime(0));
+        let text = "lost to a defect in the program; starts anew".to_owned();
+        self.send(key, &Event { header, kind: "lost".to_owned(), channel: String::new(), text }, Delivery::Events);
+    }
+}
+
+impl Drop for Outlet {
+    /// Publishes what is queued before it goes.
+    fn drop(&mut self) {
+        self.queue = None;
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+fn publish_all(bus: &dyn Bus, waiting: &Receiver<(Message, Delivery)>) {
+    let mut failures = 0_u64;
+    for (message, delivery) in waiting {
+        if let Err(error) = bus.publish(message, delivery) {
+            failures += 1;
+            if failures.is_power_of_two() {
+                tracing::warn!(%error, failures, "publishing failed");
+            }
+        }
+    }
+}
+
+/// Last values under a pattern; the JSON twins are made on demand.
+fn answer(store: &LastStore, asked: &str) -> Vec<Message> {
+    let values: Vec<(String, Vec<u8>)> = {
+        let last = store.lock().unwrap_or_else(PoisonError::into_inner);
+        last.iter().map(|(key, payload)| (key.clone(), payload.clone())).collect()
+    };
+    let mut out = Vec::new();
+    for (key, payload) in values {
+        let twin = format!("{key}/json");
+        if bus::matches(asked, &twin)
+            && let Some(json) = to_json(&key, &payload)
+        {
+            out.push(Message { key: twin, encoding: Encoding::Json, payload: json });
+        }
+        if bus::matches(asked, &key) {
+            out.push(Message { key, encoding: Encoding::Bincode, payload });
+        }
+    }
+    out
+}
+
+fn to_json(key: &str, payload: &[u8]) -> Option<Vec<u8>> {
+    fn twin<T: DeserializeOwned + ToJson>(payload: &[u8]) -> Option<Vec<u8>> {
+        let message: T = wire::decode(payload, Encoding::Bincode).ok()?;
+        Some(message.to_json().to_string().into_bytes())
+    }
+    if key.ends_with("/estimate/state") {
+        twin::<StateEstimate>(payload)
+    } else if key.ends_with("/estimate/parameters") {
+        twin::<ParameterEstimate>(payload)
+    } else if key.ends_with("/estimate/members") {
+        twin::<Members>(payload)
+    } else if key.ends_with("/status") {
+        twin::<Status>(payload)
+    } else if key.ends_with("/event") {
+        twin::<Event>(payload)
+    } else {
+        None
+    }
+}
+
+fn count(n: usize) -> u32 {
+    u32::try_from(n).unwrap_or(u32::MAX)
+}
+
+/// One published time as a message.
+fn state_message(header: Header, model: Cvsim6, estimate: &Estimate) -> StateEstimate {
+    let row = |s: &Summary| [s.mean, s.sd, s.epistemic_sd, s.aleatoric_sd, s.model_sd, s.q05, s.q95];
+    StateEstimate {
+        header,
+        members: count(estimate.members),
+        times_ns: vec![estimate.time.0],
+        since_data_s: vec![s_from_ns(estimate.since_data_ns)],
+        names: model.states().iter().chain(model.derived()).map(|q| q.name.to_owned()).collect(),
+        values: estimate.quantities.iter().flat_map(row).collect(),
+    }
+}
+
+fn parameter_message(header: Header, model: Cvsim6, estimate: &Estimate) -> ParameterEstimate {
+    let row = |(p, since): &(crate::estimate::ensemble::ParameterSummary, i64)| {
+        let s = &p.summary;
+        [s.mean, s.sd, s.q05, s.q95, p.identifiability, s_from_ns(*since)]
+    };
+    let name = |p: usize| model.parameters()[p].name.to_owned();
+    ParameterEstimate {
+        header,
+        members: count(estimate.members),
+        names: estimate.parameters.iter().map(|(p, _)| name(p.parameter)).collect(),
+        values: estimate.parameters.iter().flat_map(row).collect(),
+    }
+}
+
+fn status_message(header: Header, model: Cvsim6, health: &Health) -> Status {
+    let channel = |c: &crate::estimate::estimator::ChannelHealth| ChannelStatus {
+        name: model.states().get(c.state).map_or_else(String::new, |q| q.name.to_owned()),
+        state: match c.liveness {
+            Liveness::Never => "never",
+            Liveness::Live => "live",
+            Liveness::Silent => "silent",
+        }
+        .to_owned(),
+        last_sample_ns: c.last_sample.map_or(0, |t| t.0),
+        samples_used: c.samples_used,
+        innovation_rms: c.innovation_rms,
+    };
+    Status {
+        header,
+        members_alive: count(health.members_alive),
+        members: count(health.members),
+        windows: health.windows,
+        windows_without_data: health.windows_without_data,
+        lag_p50_ms: health.lag_p50_ms,
+        lag_p99_ms: health.lag_p99_ms,
+        lag_max_ms: health.lag_max_ms,
+        solve_ms: health.solve_ms,
+        iterations: health.iterations,
+        not_converged: health.not_converged,
+        queue_depth: count(health.queue_depth),
+        counters: health.counters.iter().map(|(cause, n)| ((*cause).to_owned(), *n)).collect(),
+        channels: health.channels.iter().map(channel).collect(),
+    }
+}

@@ -1,0 +1,288 @@
+//! Publishes a patient, synthetic or recorded, at the pace of a clock.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use super::bus::{Bus, BusError, Delivery, Encoding, Message};
+use super::config::{Config, ConfigError};
+use super::files::csv::{CsvError, RecordReader, Row};
+use super::synthetic::SyntheticPatient;
+use super::wire::{self, FLAG_LAST_BLOCK, PressureBlock, SCHEMA, ToJson, Truth, WireError};
+use crate::estimate::time::{EventTime, ns_from_s, s_from_ns};
+use crate::model::Model;
+use crate::model::cvsim6::Pressures;
+use crate::model::truth::SimulationError;
+use crate::runtime::clock::Clock;
+
+/// Longest sleep before looking whether to stop.
+const MAX_SLEEP: Duration = Duration::from_millis(50);
+
+/// What cannot be replayed.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// The record.
+    #[error(transparent)]
+    Record(#[from] CsvError),
+    /// The patient's start.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The patient on the way.
+    #[error(transparent)]
+    Simulation(#[from] SimulationError),
+    /// The bus.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// A block too large to send.
+    #[error(transparent)]
+    Wire(#[from] WireError),
+}
+
+/// How to replay.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReplayOptions {
+    /// Samples per second of a synthetic patient.
+    pub rate_hz: f64,
+    /// Patient-seconds per second.
+    pub speed: f64,
+    /// Patient-seconds; None for ever (or to the end of the record).
+    pub seconds: Option<f64>,
+    /// Length of a block \[s\].
+    pub block_s: f64,
+    /// Event time of the start \[s\].
+    pub start_s: f64,
+    /// What is true, this often per second; 0 never.
+    pub truth_rate_hz: f64,
+    /// Begin a record again when it ends.
+    pub repeat: bool,
+}
+
+impl Default for ReplayOptions {
+    fn default() -> Self {
+        Self { rate_hz: 200.0, speed: 1.0, seconds: None, block_s: 0.01, start_s: 0.0, truth_rate_hz: 50.0, repeat: false }
+    }
+}
+
+/// Where the samples of a bed come from.
+pub enum Source {
+    /// A patient of the truth simulator.
+    Synthetic(Box<SyntheticPatient>),
+    /// A record; its path is read again for every pass.
+    Record {
+        /// Where it is.
+        path: std::path::PathBuf,
+        /// Where it stands.
+        reader: Box<RecordReader>,
+        /// Added to the times of this pass \[ns\].
+        shift_ns: i64,
+        /// Time of the first row, and of the latest \[ns\].
+        span: Option<(i64, i64)>,
+    },
+}
+
+impl Source {
+    /// A synthetic patient.
+    ///
+    /// # Errors
+    /// When its initial pressures have no solution.
+    pub fn synthetic(config: &Config, seed: u64) -> Result<Self, ConfigError> {
+        Ok(Self::Synthetic(Box::new(SyntheticPatient::new(config, seed)?)))
+    }
+
+    /// A record.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    pub fn record(path: &std::path::Path, config: &Config) -> Result<Self, CsvError> {
+        let reader = Box::new(RecordReader::open(path, config)?);
+        Ok(Self::Record { path: path.to_owned(), reader, shift_ns: 0, span: None })
+    }
+}
+
+/// A bed on its way.
+pub struct Bed {
+    name: String,
+    source: Source,
+    /// Rows made so far (synthetic).
+    ticks: u64,
+    /// Next block of each state.
+    sequences: Vec<u64>,
+    /// Rows waiting to be sent: event time and values by state.
+    waiting: Vec<(EventTime, Vec<Option<f64>>)>,
+    truths: Vec<Truth>,
+    next_truth_ns: i64,
+    done: bool,
+}
+
+impl Bed {
+    /// A bed under a name.
+    #[must_use]
+    pub fn new(name: impl Into<String>, source: Source) -> Self {
+        Self {
+            name: name.into(),
+            source,
+            ticks: 0,
+            sequences: vec![0; Pressures::LEN],
+            waiting: Vec::new(),
+            truths: Vec::new(),
+            next_truth_ns: 0,
+            done: false,
+        }
+    }
+
+    /// Makes the next row; false at the end.
+    #[allow(clippy::cast_precision_loss)]
+    fn make_row(&mut self, config: &Config, options: &ReplayOptions) -> Result<bool, ReplayError> {
+        let start_ns = ns_from_s(options.start_s);
+        let limit_ns = options.seconds.map_or(i64::MAX, ns_from_s);
+        match &mut self.source {
+            Source::Synthetic(patient) => {
+                let t = self.ticks as f64 / options.rate_hz;
+                let elapsed_ns = ns_from_s(t);
+                if elapsed_ns > limit_ns {
+                    return Ok(false);
+                }
+                self.ticks += 1;
+                patient.advance_to(t)?;
+                let observed = patient.observe().into_iter().map(Some).collect();
+                let time = EventTime(start_ns + elapsed_ns);
+                if options.truth_rate_hz > 0.0 && elapsed_ns >= self.next_truth_ns {
+                    self.truths.push(truth(patient, time));
+                    self.next_truth_ns += ns_from_s(1.0 / options.truth_rate_hz);
+                }
+                self.waiting.push((time, observed));
+                Ok(true)
+            }
+            Source::Record { path, reader, shift_ns, span } => {
+                let row = match reader.next_row()? {
+                    Some(row) => row,
+                    None if !options.repeat => return Ok(false),
+                    None => {
+                        let (first, last) = span.unwrap_or((0, 0));
+                        *reader = Box::new(RecordReader::open(path, config)?);
+                        let Some(row) = reader.next_row()? else { return Ok(false) };
+                        // The next pass begins one typical spacing after the last row.
+                        *shift_ns += last - first + ns_from_s(1.0 / options.rate_hz);
+                        row
+                    }
+                };
+                let (first, _) = span.get_or_insert((row.time.0, row.time.0));
+                let first = *first;
+                *span = Some((first, row.time.0));
+                let time = EventTime(start_ns + row.time.0 + *shift_ns);
+                if time.0 - start_ns - first > limit_ns {
+                    return Ok(false);
+                }
+                let states = reader.states().to_vec();
+                self.waiting.push((time, by_state(&states, &row)));
+                Ok(true)
+            }
+        }
+    }
+
+    /// Sends the waiting rows as one block per observed state.
+    fn flush(&mut self, bus: &dyn Bus, config: &Config, last: bool) -> Result<(), ReplayError> {
+        for (state, name) in Pressures::NAMES.iter().enumerate() {
+            if !config.observed.iter().any(|o| o == name) {
+                continue;
+            }
+            let samples: Vec<(i64, f64)> =
+                self.waiting.iter().filter_map(|(t, row)| row[state].map(|v| (t.0, v))).collect();
+            if samples.is_empty() && !(last && self.sequences[state] > 0) {
+                continue;
+            }
+            let start_ns = samples.first().map_or(0, |(t, _)| *t);
+            let block = PressureBlock {
+                schema: SCHEMA,
+                sequence: self.sequences[state],
+                flags: if last { FLAG_LAST_BLOCK } else { 0 },
+                start_ns,
+                period_ns: 0,
+                offsets_ns: samples.iter().map(|(t, _)| t - start_ns).collect(),
+                values: samples.iter().map(|(_, v)| *v).collect(),
+            };
+            self.sequences[state] += 1;
+            let key = format!("{}/{}/pressure/{name}", config.publish.prefix, self.name);
+            let message = Message { key, encoding: Encoding::Bincode, payload: wire::encode(&block)? };
+            bus.publish(message, Delivery::Samples)?;
+        }
+        self.waiting.clear();
+        for truth in std::mem::take(&mut self.truths) {
+            let key = format!("{}/{}/truth", config.publish.prefix, self.name);
+            let twin = format!("{key}/json");
+            if config.publish.json && bus.is_wanted(&twin) {
+                let payload = truth.to_json().to_string().into_bytes();
+                bus.publish(Message { key: twin, encoding: Encoding::Json, payload }, Delivery::Estimates)?;
+            }
+            let payload = wire::encode(&truth)?;
+            bus.publish(Message { key, encoding: Encoding::Bincode, payload }, Delivery::Estimates)?;
+        }
+        Ok(())
+    }
+}
+
+fn by_state(states: &[usize], row: &Row) -> Vec<Option<f64>> {
+    let mut values = vec![None; Pressures::LEN];
+    for (state, value) in states.iter().zip(&row.values) {
+        values[*state] = *value;
+    }
+    values
+}
+
+fn truth(patient: &SyntheticPatient, time: EventTime) -> Truth {
+    let model = patient.model();
+    let quantities = model.states().iter().chain(model.derived()).map(|q| q.name.to_owned());
+    let names = quantities.chain(model.parameters().iter().map(|p| p.name.to_owned())).collect();
+    let values = patient.truth().into_iter().chain(patient.parameters().iter().copied()).collect();
+    Truth { schema: SCHEMA, time_ns: time.0, names, values }
+}
+
+/// Publishes all beds side by side until they end or `stop` is set; returns the patient-seconds published.
+///
+/// # Errors
+/// When a source cannot go on or the bus is closed.
+#[allow(clippy::cast_precision_loss)]
+pub fn run(
+    bus: &dyn Bus,
+    config: &Config,
+    options: &ReplayOptions,
+    beds: &mut [Bed],
+    stop: &AtomicBool,
+) -> Result<f64, ReplayError> {
+    let clock = Clock::start();
+    let block_ns = ns_from_s(options.block_s).max(1);
+    let mut origin: Option<i64> = None;
+    let mut sent_ns = 0_i64;
+    while beds.iter().any(|bed| !bed.done) && !stop.load(Ordering::Relaxed) {
+        // Samples up to here exist once the clock says so.
+        let until = sent_ns.saturating_add(block_ns);
+        for bed in beds.iter_mut().filter(|bed| !bed.done) {
+            let mut more = true;
+            while more && bed.waiting.last().is_none_or(|(t, _)| t.0 - origin.unwrap_or(t.0) < until) {
+                more = bed.make_row(config, options)?;
+                if let Some((t, _)) = bed.waiting.first() {
+                    origin.get_or_insert(t.0);
+                }
+            }
+            bed.done = !more;
+        }
+        wait_until(&clock, s_from_ns(until) / options.speed, stop);
+        for bed in beds.iter_mut() {
+            if !bed.waiting.is_empty() || bed.done {
+                bed.flush(bus, config, bed.done)?;
+            }
+        }
+        beds.iter_mut().filter(|bed| bed.done).for_each(|bed| bed.sequences.fill(0));
+        sent_ns = until;
+    }
+    Ok(s_from_ns(sent_ns))
+}
+
+fn wait_until(clock: &Clock, seconds: f64, stop: &AtomicBool) {
+    while !stop.load(Ordering::Relaxed) {
+        let left = seconds - s_from_ns(clock.now().0);
+        if left <= 0.0 {
+            return;
+        }
+        std::thread::sleep(Duration::from_secs_f64(left).min(MAX_SLEEP));
+    }
+}

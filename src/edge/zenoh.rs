@@ -1,0 +1,187 @@
+//! The bus on zenoh. Mode, endpoints and scouting are always explicit: nothing is listened to or searched for
+//! that the configuration does not name.
+
+use std::collections::HashMap;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use zenoh::Wait;
+use zenoh::bytes::Encoding as ZenohEncoding;
+use zenoh::pubsub::Publisher;
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::query::{ConsolidationMode, Query};
+use zenoh::sample::Sample;
+
+use super::bus::{Bus, BusError, Delivery, Encoding, Handler, LastValues, Message, Subscription, check_key};
+use super::config::{ZenohMode, ZenohSettings};
+
+/// Requests for last values that may wait; more are not answered.
+const MAX_WAITING_QUERIES: usize = 256;
+
+/// Publishers kept declared; more keys than this are published without.
+const MAX_PUBLISHERS: usize = 16_384;
+
+/// A zenoh session as a bus.
+#[derive(Clone)]
+pub struct ZenohBus {
+    session: zenoh::Session,
+    publishers: Arc<Mutex<HashMap<String, Arc<Publisher<'static>>>>>,
+}
+
+fn transport(error: impl std::fmt::Display) -> BusError {
+    BusError::Transport(error.to_string())
+}
+
+impl ZenohBus {
+    /// Opens a session.
+    ///
+    /// # Errors
+    /// When an endpoint is not valid, taken, or cannot be reached.
+    pub fn open(settings: &ZenohSettings) -> Result<Self, BusError> {
+        let mode = match settings.mode {
+            ZenohMode::Peer => "peer",
+            ZenohMode::Client => "client",
+            ZenohMode::Router => "router",
+        };
+        let listen = serde_json::json!(settings.listen).to_string();
+        let connect = serde_json::json!(settings.connect).to_string();
+        let mut config = zenoh::Config::default();
+        for (key, value) in [
+            ("mode", format!("\"{mode}\"").as_str()),
+            ("listen/endpoints", listen.as_str()),
+            ("connect/endpoints", connect.as_str()),
+            ("scouting/multicast/enabled", "false"),
+            ("scouting/gossip/enabled", "false"),
+            ("transport/shared_memory/enabled", "false"),
+        ] {
+            config.insert_json5(key, value).map_err(|e| transport(format!("{key} = {value}: {e}")))?;
+        }
+        let session = zenoh::open(config).wait().map_err(|e| {
+            transport(format!("cannot open a session (listen {listen}, connect {connect}): {e}"))
+        })?;
+        Ok(Self { session, publishers: Arc::default() })
+    }
+
+    /// Closes the session; waits at most a few seconds.
+    pub fn close(&self) {
+        self.publishers.lock().unwrap_or_else(PoisonError::into_inner).clear();
+        // On a lossy link closing may take long; it is bounded by leaving it to a thread of its own.
+        let session = self.session.clone();
+        let (done, closed) = sync_channel(1);
+        std::thread::spawn(move || {
+            let _ = session.close().wait();
+            let _ = done.send(());
+        });
+        let _ = closed.recv_timeout(Duration::from_secs(3));
+    }
+
+    fn publisher(&self, key: &str, delivery: Delivery) -> Result<Arc<Publisher<'static>>, BusError> {
+        let mut publishers = self.publishers.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(publisher) = publishers.get(key) {
+            return Ok(Arc::clone(publisher));
+        }
+        check_key(key)?;
+        let (congestion, priority) = match delivery {
+            Delivery::Samples => (CongestionControl::Drop, Priority::RealTime),
+            Delivery::Estimates => (CongestionControl::Drop, Priority::DataHigh),
+            Delivery::Events => (CongestionControl::Block, Priority::InteractiveHigh),
+        };
+        let publisher = self
+            .session
+            .declare_publisher(key.to_owned())
+            .congestion_control(congestion)
+            .priority(priority)
+            .express(delivery == Delivery::Samples)
+            .wait()
+            .map_err(transport)?;
+        let publisher = Arc::new(publisher);
+        if publishers.len() < MAX_PUBLISHERS {
+            publishers.insert(key.to_owned(), Arc::clone(&publisher));
+        }
+        Ok(publisher)
+    }
+}
+
+fn to_zenoh(encoding: Encoding) -> ZenohEncoding {
+    match encoding {
+        Encoding::Bincode => ZenohEncoding::APPLICATION_OCTET_STREAM.with_schema("hemostream-bincode-1"),
+        Encoding::Json => ZenohEncoding::APPLICATION_JSON,
+    }
+}
+
+fn message(sample: &Sample) -> Message {
+    let encoding = sample.encoding().to_string();
+    let json = encoding.starts_with("application/json") || encoding.starts_with("text/json");
+    Message {
+        key: sample.key_expr().as_str().to_owned(),
+        encoding: if json { Encoding::Json } else { Encoding::Bincode },
+        payload: sample.payload().to_bytes().into_owned(),
+    }
+}
+
+impl Bus for ZenohBus {
+    fn publish(&self, message: Message, delivery: Delivery) -> Result<(), BusError> {
+        let publisher = self.publisher(&message.key, delivery)?;
+        publisher.put(message.payload).encoding(to_zenoh(message.encoding)).wait().map_err(transport)
+    }
+
+    fn is_wanted(&self, key: &str) -> bool {
+        let publisher = self.publisher(key, Delivery::Estimates);
+        publisher.is_ok_and(|p| p.matching_status().wait().is_ok_and(|status| status.matching()))
+    }
+
+    fn subscribe(&self, pattern: &str, handler: Handler) -> Result<Subscription, BusError> {
+        check_key(pattern)?;
+        let subscriber = self
+            .session
+            .declare_subscriber(pattern.to_owned())
+            .callback(move |sample| handler(message(&sample)))
+            .wait()
+            .map_err(transport)?;
+        Ok(Subscription::new(subscriber))
+    }
+
+    fn offer_last_values(&self, pattern: &str, answer: LastValues) -> Result<Subscription, BusError> {
+        check_key(pattern)?;
+        // Replying may block, a callback must not: the answers come from a thread of their own.
+        let (queries, waiting): (SyncSender<Query>, Receiver<Query>) = sync_channel(MAX_WAITING_QUERIES);
+        std::thread::Builder::new()
+            .name("last-values".to_owned())
+            .spawn(move || {
+                for query in waiting {
+                    for m in answer(query.key_expr().as_str()) {
+                        let _ = query.reply(m.key, m.payload).encoding(to_zenoh(m.encoding)).wait();
+                    }
+                }
+            })
+            .map_err(transport)?;
+        let queryable = self
+            .session
+            .declare_queryable(pattern.to_owned())
+            .callback(move |query| {
+                let _ = queries.try_send(query);
+            })
+            .wait()
+            .map_err(transport)?;
+        Ok(Subscription::new(queryable))
+    }
+
+    fn last_values(&self, pattern: &str, timeout: Duration) -> Result<Vec<Message>, BusError> {
+        check_key(pattern)?;
+        let replies = self
+            .session
+            .get(pattern.to_owned())
+            .consolidation(ConsolidationMode::None)
+            .timeout(timeout)
+            .wait()
+            .map_err(transport)?;
+        let mut messages = Vec::new();
+        while let Ok(reply) = replies.recv() {
+            if let Ok(sample) = reply.result() {
+                messages.push(message(sample));
+            }
+        }
+        Ok(messages)
+    }
+}

@@ -1,0 +1,250 @@
+//! A bed as the runtime keeps it: its estimator, and the tallies of how it goes.
+
+use std::collections::BTreeMap;
+
+use hdrhistogram::Histogram;
+
+use super::clock::Clock;
+use crate::estimate::ensemble::Parallel;
+use crate::estimate::estimator::{
+    ChannelHealth, Estimator, Input, Notice, NoticeKind, Output, REPORT_EVERY_NS,
+};
+use crate::estimate::time::{ArrivalTime, EventTime, s_from_ns};
+use crate::estimate::window::{Liveness, RawSample};
+use crate::model::cvsim6::Cvsim6;
+
+/// Longest lag that the histogram tells apart \[us\].
+const MAX_LAG_US: u64 = 600_000_000;
+
+/// Weight of the newest job in the running mean of the solve time.
+const SOLVE_WEIGHT: f64 = 0.1;
+
+/// What a bed is asked to do.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Task {
+    /// Samples of a channel.
+    Samples {
+        /// Index of the channel.
+        channel: usize,
+        /// Sender's count of blocks.
+        sequence: u64,
+        /// The sender will send no more on this channel.
+        last: bool,
+        /// The samples.
+        samples: Vec<RawSample>,
+    },
+    /// Something came that the edge could not make sense of.
+    Refused(&'static str),
+    /// Time has passed.
+    Tick,
+    /// Say how it goes.
+    Report {
+        /// Whether somebody wants the whole ensemble.
+        want_members: bool,
+        /// Tasks that are waiting.
+        queue_depth: usize,
+        /// Tasks lost because too many were waiting.
+        queue_full: u64,
+    },
+}
+
+/// How a bed goes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Health {
+    /// End of the last window.
+    pub time: EventTime,
+    /// Members configured.
+    pub members: usize,
+    /// Members that took part in the last window.
+    pub members_alive: usize,
+    /// Windows solved.
+    pub windows: u64,
+    /// Of these, without a sample.
+    pub windows_without_data: u64,
+    /// Median lag from closing to estimate \[ms\], over windows since the start.
+    pub lag_p50_ms: f64,
+    /// 99th percentile.
+    pub lag_p99_ms: f64,
+    /// Largest.
+    pub lag_max_ms: f64,
+    /// Mean time per window, lately \[ms\].
+    pub solve_ms: f64,
+    /// Mean iterations per member and window.
+    pub iterations: f64,
+    /// Member-windows that did not converge.
+    pub not_converged: u64,
+    /// Tasks waiting.
+    pub queue_depth: usize,
+    /// What was refused or lost, by cause.
+    pub counters: BTreeMap<&'static str, u64>,
+    /// The channels.
+    pub channels: Vec<ChannelHealth>,
+}
+
+/// A bed.
+pub struct Bed {
+    /// Its name.
+    pub name: String,
+    estimator: Estimator<Cvsim6>,
+    clock: Clock,
+    windows: u64,
+    windows_without_data: u64,
+    members_alive: usize,
+    iterations: u64,
+    not_converged: u64,
+    solve_ms: f64,
+    lag_us: Option<Histogram<u64>>,
+    counters: BTreeMap<&'static str, u64>,
+    /// Last event about each cause.
+    reported: BTreeMap<&'static str, ArrivalTime>,
+    /// Next sequence number per channel.
+    expected: Vec<Option<u64>>,
+    ended: Vec<bool>,
+    last_window: EventTime,
+}
+
+impl Bed {
+    /// A bed that waits for its first sample.
+    #[must_use]
+    pub fn new(name: String, estimator: Estimator<Cvsim6>, clock: Clock) -> Self {
+        let channels = estimator.settings().channels.len();
+        Self {
+            name,
+            clock,
+            windows: 0,
+            windows_without_data: 0,
+            members_alive: estimator.settings().members,
+            iterations: 0,
+            not_converged: 0,
+            solve_ms: 0.0,
+            lag_us: Histogram::new_with_max(MAX_LAG_US, 3).ok(),
+            counters: BTreeMap::new(),
+            reported: BTreeMap::new(),
+            expected: vec![None; channels],
+            ended: vec![false; channels],
+            last_window: EventTime(0),
+            estimator,
+        }
+    }
+
+    /// The estimator.
+    #[must_use]
+    pub fn estimator(&self) -> &Estimator<Cvsim6> {
+        &self.estimator
+    }
+
+    /// Does one task; `arrived` is when it came in.
+    pub fn handle(
+        &mut self,
+        task: Task,
+        arrived: ArrivalTime,
+        parallel: &dyn Parallel,
+        out: &mut Vec<Output>,
+    ) -> Option<Health> {
+        match task {
+            Task::Samples { channel, sequence, last, samples } => {
+                self.count_lost(channel, sequence);
+                self.drive(Input::Samples { channel, samples }, arrived, parallel, out);
+                if let Some(ended) = self.ended.get_mut(channel) {
+                    *ended = last;
+                }
+                if last && self.every_live_channel_ended() {
+                    self.drive(Input::End, arrived, parallel, out);
+                }
+            }
+            Task::Refused(cause) => self.refuse(cause, arrived, out),
+            Task::Tick => self.drive(Input::Tick, arrived, parallel, out),
+            Task::Report { want_members, queue_depth, queue_full } => {
+                self.drive(Input::WantMembers(want_members), arrived, parallel, out);
+                return Some(self.health(queue_depth, queue_full));
+            }
+        }
+        None
+    }
+
+    /// Counts a message that the edge did not understand, and says so once in a while.
+    fn refuse(&mut self, cause: &'static str, arrived: ArrivalTime, out: &mut Vec<Output>) {
+        *self.counters.entry(cause).or_default() += 1;
+        if self.reported.get(cause).is_none_or(|at| arrived.ns_since(*at) >= REPORT_EVERY_NS) {
+            self.reported.insert(cause, arrived);
+            out.push(Output::Notice(Notice {
+                time: self.last_window,
+                kind: NoticeKind::NotUnderstood(cause),
+                channel: None,
+            }));
+        }
+    }
+
+    fn every_live_channel_ended(&self) -> bool {
+        let channels = self.estimator.channels();
+        channels.iter().zip(&self.ended).all(|(c, ended)| *ended || c.liveness != Liveness::Live)
+    }
+
+    fn count_lost(&mut self, channel: usize, sequence: u64) {
+        let Some(expected) = self.expected.get_mut(channel) else { return };
+        if let Some(due) = *expected {
+            // A sender that starts again counts from 0.
+            let lost = if sequence > due { sequence - due } else { 0 };
+            if lost > 0 {
+                *self.counters.entry("lost_blocks").or_default() += lost;
+            }
+        }
+        *expected = Some(sequence.wrapping_add(1));
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn drive(&mut self, input: Input, arrived: ArrivalTime, parallel: &dyn Parallel, out: &mut Vec<Output>) {
+        let first = out.len();
+        let started = self.clock.now();
+        self.estimator.handle(input, arrived, parallel, out);
+        let finished = self.clock.now();
+        let mut windows = 0_u32;
+        for output in &out[first..] {
+            let Output::Window(window) = output else { continue };
+            windows += 1;
+            self.windows += 1;
+            self.windows_without_data += u64::from(window.samples == 0);
+            self.members_alive = window.report.solved;
+            self.iterations += window.report.iterations as u64;
+            self.not_converged += window.report.not_converged as u64;
+            self.last_window = window.end;
+            let lag_us = u64::try_from(finished.ns_since(window.closed_at) / 1000).unwrap_or(0);
+            if let Some(histogram) = &mut self.lag_us {
+                histogram.saturating_record(lag_us);
+            }
+        }
+        if windows > 0 {
+            let per_window_ms = s_from_ns(finished.ns_since(started)) * 1e3 / f64::from(windows);
+            self.solve_ms += if self.solve_ms > 0.0 { SOLVE_WEIGHT } else { 1.0 } * (per_window_ms - self.solve_ms);
+        }
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn health(&self, queue_depth: usize, queue_full: u64) -> Health {
+        let lag = |quantile: f64| {
+            self.lag_us.as_ref().map_or(f64::NAN, |h| h.value_at_quantile(quantile) as f64 / 1e3)
+        };
+        let members = self.estimator.settings().members;
+        let mut counters = self.counters.clone();
+        counters.extend(self.estimator.refused().iter().map(|(cause, n)| (cause.name(), *n)));
+        counters.insert("restarts", self.estimator.restarts());
+        counters.insert("queue_full", queue_full);
+        counters.retain(|_, n| *n > 0);
+        Health {
+            time: self.last_window,
+            members,
+            members_alive: self.members_alive,
+            windows: self.windows,
+            windows_without_data: self.windows_without_data,
+            lag_p50_ms: lag(0.5),
+            lag_p99_ms: lag(0.99),
+            lag_max_ms: lag(1.0),
+            solve_ms: self.solve_ms,
+            iterations: self.iterations as f64 / (self.windows.max(1) * members as u64) as f64,
+            not_converged: self.not_converged,
+            queue_depth,
+            counters,
+            channels: self.estimator.channels(),
+        }
+    }
+}

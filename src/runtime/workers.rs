@@ -1,0 +1,59 @@
+//! A fixed pool of threads for the solves.
+
+use rayon::iter::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
+
+use crate::estimate::ensemble::{Member, Parallel};
+
+/// Members handed to a thread at a time: enough work to be worth the hand-over.
+const CHUNK: usize = 12;
+
+/// The pool.
+pub struct Workers {
+    pool: rayon::ThreadPool,
+}
+
+/// The pool could not be started.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("cannot start {threads} worker threads: {reason}")]
+pub struct WorkersError {
+    threads: usize,
+    reason: String,
+}
+
+impl Workers {
+    /// Starts `threads` threads; 0 is one per core.
+    ///
+    /// # Errors
+    /// When the system does not give the threads.
+    pub fn start(threads: usize) -> Result<Self, WorkersError> {
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .thread_name(|i| format!("solve-{i}"))
+            .build()
+            .map_err(|e| WorkersError { threads, reason: e.to_string() })?;
+        Ok(Self { pool })
+    }
+
+    /// Number of threads.
+    #[must_use]
+    pub fn threads(&self) -> usize {
+        self.pool.current_num_threads()
+    }
+
+    /// Runs `job` on some thread of the pool, some time.
+    pub fn spawn(&self, job: impl FnOnce() + Send + 'static) {
+        self.pool.spawn(job);
+    }
+}
+
+impl Parallel for Workers {
+    fn for_each(&self, members: &mut [Member], job: &(dyn Fn(usize, &mut Member) + Sync)) {
+        if self.threads() == 1 {
+            members.iter_mut().enumerate().for_each(|(i, member)| job(i, member));
+        } else {
+            self.pool.install(|| {
+                members.par_iter_mut().enumerate().with_min_len(CHUNK).for_each(|(i, member)| job(i, member));
+            });
+        }
+    }
+}
