@@ -6,6 +6,7 @@
 
 pub mod bus;
 pub mod config;
+pub mod dashboard;
 pub mod files;
 pub mod inlet;
 pub mod outlet;

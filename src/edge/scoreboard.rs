@@ -136,8 +136,11 @@ impl Scoreboard {
             let Some(&value) = truth.values.get(at) else { continue };
             self.scores.entry(name.clone()).or_default().add(value, *mean, *q05, *q95);
             if at >= crate::model::cvsim6::Pressures::LEN + crate::model::cvsim6::FlowsAndVolumes::LEN {
-                self.parameters.retain(|(n, ..)| n != name);
-                self.parameters.push((name.clone(), *mean, *q05, *q95, value));
+                let row = (name.clone(), *mean, *q05, *q95, value);
+                match self.parameters.iter_mut().find(|(n, ..)| n == name) {
+                    Some(known) => *known = row,
+                    None => self.parameters.push(row),
+                }
             }
         }
     }

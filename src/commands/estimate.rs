@@ -1,0 +1,186 @@
+//! `hemostream estimate`: the estimator over a file.
+
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use hemostream::edge::config::Config;
+use hemostream::edge::files::csv::{RecordReader, TableWriter, estimate_header, estimate_row};
+use hemostream::estimate::estimator::{Estimator, Input, Output};
+use hemostream::estimate::time::ArrivalTime;
+use hemostream::estimate::window::RawSample;
+use hemostream::model::Model;
+use hemostream::model::cvsim6::{Cvsim6, Pressures};
+use hemostream::runtime::clock::Clock;
+use hemostream::runtime::workers::Workers;
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::{ConfigArgs, Failure, failed, say};
+
+/// Run the estimator over a record, as fast as the machine goes
+#[derive(Args)]
+#[command(after_help = "Example:  hemostream estimate observed.csv --config config/paper.toml --output out.csv")]
+pub(crate) struct Estimate {
+    /// Record (CSV): `time_s` and any of the six pressures, by name or monitor label
+    #[arg(value_name = "INPUT")]
+    input: PathBuf,
+    #[command(flatten)]
+    config: ConfigArgs,
+    /// Where to write the estimates (CSV)
+    #[arg(long, value_name = "FILE")]
+    output: PathBuf,
+    /// Worker threads, over the configuration; 0 is one per core
+    #[arg(long)]
+    threads: Option<usize>,
+}
+
+/// The nearest whole number of a positive one.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub(crate) fn whole(value: f64) -> u64 {
+    value.round() as u64
+}
+
+impl Estimate {
+    pub(crate) fn run(&self) -> Result<(), Failure> {
+        let (config, _) = self.config.load()?;
+        let known = |e: &str| e.eq_ignore_ascii_case("csv");
+        if !self.output.extension().and_then(|e| e.to_str()).is_some_and(known) {
+            let message = format!("{}: found another ending, expected .csv", self.output.display());
+            return Err(Failure::Input(message));
+        }
+        let workers = Workers::start(self.threads.unwrap_or(config.service.workers)).map_err(failed)?;
+        // Read it to the end once: a bad cell is reported before anything is computed or written.
+        let seconds = check_record(&self.input, &config)?;
+        let reader = RecordReader::open(&self.input, &config)?;
+        let mut run = Run::new(&config, &self.output, &reader, seconds)?;
+        run.record(reader, &workers)?;
+        run.finish(&workers)
+    }
+}
+
+/// Reads the whole record; returns its length \[s\].
+fn check_record(path: &Path, config: &Config) -> Result<f64, Failure> {
+    let mut reader = RecordReader::open(path, config)?;
+    let (mut first, mut last) = (None, None);
+    while let Some(row) = reader.next_row()? {
+        first.get_or_insert(row.time);
+        last = Some(row.time);
+    }
+    Ok(first.zip(last).map_or(0.0, |(first, last)| last.as_s() - first.as_s()))
+}
+
+/// An estimator between a record and a table.
+struct Run {
+    estimator: Estimator<Cvsim6>,
+    /// Channel of each column, where it is listened to.
+    channels: Vec<Option<usize>>,
+    table: TableWriter,
+    outputs: Vec<Output>,
+    progress: ProgressBar,
+    clock: Clock,
+    seconds: f64,
+    windows: u64,
+    iterations: u64,
+    not_converged: u64,
+    notices: u64,
+    last: ArrivalTime,
+}
+
+impl Run {
+    fn new(config: &Config, output: &Path, reader: &RecordReader, seconds: f64) -> Result<Self, Failure> {
+        let model = config.patient.model();
+        let estimator = Estimator::new(model, config.estimator_settings()?).map_err(failed)?;
+        let channel = |state: &usize| estimator.settings().channels.iter().position(|c| c.state == *state);
+        let channels: Vec<Option<usize>> = reader.states().iter().map(channel).collect();
+        for (state, _) in reader.states().iter().zip(&channels).filter(|(_, c)| c.is_none()) {
+            tracing::warn!("column {} is not in `observed` and is ignored", Pressures::NAMES[*state]);
+        }
+        if channels.iter().all(Option::is_none) {
+            let expected = config.observed.join(", ");
+            return Err(Failure::Input(format!("no column of the record is observed, expected one of {expected}")));
+        }
+        let progress = if std::io::stderr().is_terminal() { ProgressBar::new(whole(seconds)) } else { ProgressBar::hidden() };
+        let style = ProgressStyle::with_template("{bar:40} {pos}/{len} s  {eta} left");
+        progress.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+        Ok(Self {
+            table: TableWriter::create(output, &estimate_header(model, estimator.estimated()))?,
+            estimator,
+            channels,
+            outputs: Vec::new(),
+            progress,
+            clock: Clock::start(),
+            seconds,
+            windows: 0,
+            iterations: 0,
+            not_converged: 0,
+            notices: 0,
+            last: ArrivalTime(0),
+        })
+    }
+
+    /// A file has no arrivals: every sample arrives when it was taken.
+    fn record(&mut self, mut reader: RecordReader, workers: &Workers) -> Result<(), Failure> {
+        let mut start = None;
+        while let Some(row) = reader.next_row()? {
+            self.last = ArrivalTime(row.time.0);
+            for (column, value) in row.values.iter().enumerate() {
+                if let (Some(channel), Some(value)) = (self.channels[column], *value) {
+                    let samples = vec![RawSample { time: row.time, value }];
+                    self.drive(Input::Samples { channel, samples }, workers)?;
+                }
+            }
+            // A row without a sample still tells the time.
+            if row.values.iter().all(Option::is_none) {
+                self.drive(Input::Tick, workers)?;
+            }
+            let start = *start.get_or_insert(row.time.as_s());
+            self.progress.set_position(whole(row.time.as_s() - start));
+        }
+        Ok(())
+    }
+
+    fn drive(&mut self, input: Input, workers: &Workers) -> Result<(), Failure> {
+        self.estimator.handle(input, self.last, workers, &mut self.outputs);
+        for output in self.outputs.drain(..) {
+            match output {
+                Output::Estimate(estimate) => self.table.row(&estimate_row(&estimate))?,
+                Output::Window(window) => {
+                    self.windows += 1;
+                    self.iterations += window.report.iterations as u64;
+                    self.not_converged += window.report.not_converged as u64;
+                }
+                Output::Notice(notice) => {
+                    self.notices += 1;
+                    let (channel, model) = (notice.channel, self.estimator.model());
+                    let name = channel.map_or("", |c| model.states()[self.estimator.settings().channels[c].state].name);
+                    tracing::info!(time_s = notice.time.as_s(), channel = name, "{}: {}", notice.kind.name(), notice.kind.text());
+                }
+            }
+        }
+        Ok(())
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn finish(mut self, workers: &Workers) -> Result<(), Failure> {
+        self.drive(Input::End, workers)?;
+        self.progress.finish_and_clear();
+        self.table.finish()?;
+        let wall = hemostream::estimate::time::s_from_ns(self.clock.now().0);
+        let member_windows = self.windows as f64 * self.estimator.settings().members as f64;
+        say(format!(
+            "{:.3} s of record in {wall:.2} s ({:.1} patient-seconds per second), {} windows, {:.2} iterations per \
+             member and window, {} not converged",
+            self.seconds,
+            self.seconds / wall,
+            self.windows,
+            self.iterations as f64 / member_windows.max(1.0),
+            self.not_converged,
+        ));
+        let refused: Vec<String> =
+            self.estimator.refused().iter().map(|(cause, n)| format!("{n} {}", cause.name())).collect();
+        if !refused.is_empty() {
+            say(format!("samples refused: {}", refused.join(", ")));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,103 @@
+//! `hemostream serve`: the daemon.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use clap::Args;
+use hemostream::edge::bus::Bus;
+use hemostream::edge::config::Config;
+use hemostream::edge::zenoh::ZenohBus;
+use hemostream::edge::{inlet, outlet::Outlet};
+use hemostream::runtime::clock::Clock;
+use hemostream::runtime::service::{Inlet, Limits, Service};
+use hemostream::runtime::workers::Workers;
+
+use super::{ConfigArgs, Failure, failed, log_to_stderr, say};
+
+/// Run the daemon: estimate every bed whose pressures arrive
+#[derive(Args)]
+#[command(after_help = "Example:  hemostream serve --config config/default.toml\n\nBeds appear with their first \
+                        sample on PREFIX/BED/pressure/CHANNEL. Stops on Ctrl-C or SIGTERM.")]
+pub(crate) struct Serve {
+    #[command(flatten)]
+    config: ConfigArgs,
+}
+
+/// A running daemon within this process.
+pub(crate) struct Running {
+    inlet: Inlet,
+    task: tokio::task::JoinHandle<()>,
+    _listening: hemostream::edge::bus::Subscription,
+}
+
+impl Running {
+    /// Starts the service on a bus; needs a tokio runtime.
+    pub(crate) fn start(bus: Arc<dyn Bus>, config: &Config) -> Result<Self, Failure> {
+        let workers = Arc::new(Workers::start(config.service.workers).map_err(failed)?);
+        let sink = Arc::new(Outlet::start(Arc::clone(&bus), config)?);
+        let limits = Limits {
+            max_beds: config.service.max_beds,
+            queue_tasks: config.service.queue_blocks,
+            report_every: Duration::from_secs_f64(1.0 / config.publish.status_rate_hz),
+        };
+        let settings = config.estimator_settings()?;
+        let (service, inlet) =
+            Service::new(config.patient.model(), settings, limits, workers, sink, Clock::start()).map_err(failed)?;
+        let task = tokio::spawn(service.run());
+        let listening = inlet::listen(bus.as_ref(), config, inlet.clone())?;
+        Ok(Self { inlet, task, _listening: listening })
+    }
+
+    /// Finishes what is waiting and stops.
+    pub(crate) async fn stop(self) {
+        self.inlet.stop().await;
+        if tokio::time::timeout(Duration::from_secs(10), self.task).await.is_err() {
+            tracing::warn!("the service did not stop in time");
+        }
+        if self.inlet.dropped() > 0 {
+            tracing::warn!(dropped = self.inlet.dropped(), "messages were dropped because the service was behind");
+        }
+    }
+}
+
+/// A tokio runtime small enough to leave the cores to the solves.
+pub(crate) fn tokio_runtime() -> Result<tokio::runtime::Runtime, Failure> {
+    tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().map_err(failed)
+}
+
+/// Waits for Ctrl-C or SIGTERM.
+pub(crate) async fn asked_to_stop() {
+    #[cfg(unix)]
+    {
+        let terminate = tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate());
+        if let Ok(mut terminate) = terminate {
+            tokio::select! {
+                _ = tokio::signal::ctrl_c() => {}
+                _ = terminate.recv() => {}
+            }
+            return;
+        }
+    }
+    let _ = tokio::signal::ctrl_c().await;
+}
+
+impl Serve {
+    pub(crate) fn run(&self) -> Result<(), Failure> {
+        let (config, _) = self.config.load()?;
+        log_to_stderr();
+        tokio_runtime()?.block_on(async {
+            let bus = ZenohBus::open(&config.zenoh)?;
+            let running = Running::start(Arc::new(bus.clone()), &config)?;
+            say(format!(
+                "hemostream serves {}/*/pressure/* at {} (config {:016x}); Ctrl-C stops",
+                config.publish.prefix,
+                config.zenoh.listen.iter().chain(&config.zenoh.connect).cloned().collect::<Vec<_>>().join(", "),
+                config.hash(),
+            ));
+            asked_to_stop().await;
+            running.stop().await;
+            bus.close();
+            Ok(())
+        })
+    }
+}

@@ -1,0 +1,156 @@
+//! The terminal dashboard: a bedside monitor for every bed on the bus.
+//!
+//! [`run`] owns the terminal and the clock; `ward` is what is known, `ui` what is chosen, `view` a pure function
+//! of both. Deliberately absent: anything that is published. A watcher subscribes to what it shows and no more,
+//! so that neither JSON twins nor whole ensembles are sent on its account.
+
+mod beds;
+mod history;
+mod panels;
+mod paper;
+mod style;
+#[cfg(test)]
+mod tests;
+mod traces;
+mod ui;
+mod view;
+mod ward;
+
+use std::io;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use ratatui::DefaultTerminal;
+use ratatui::crossterm::event::{self, Event};
+
+use self::ui::{Next, Ui};
+use self::ward::Ward;
+use crate::edge::bus::{Bus, BusError, Handler, Message, Subscription};
+
+/// What is shown, under `PREFIX/BED/`.
+const TOPICS: [&str; 6] = ["pressure/*", "estimate/state", "estimate/parameters", "truth", "status", "event"];
+/// Messages between the bus and the screen; more are dropped and counted.
+const QUEUE: usize = 16_384;
+/// Time between two pictures.
+const FRAME: Duration = Duration::from_millis(55);
+/// Longest work on messages between two pictures, so that keys are obeyed under any load.
+const SHARE: Duration = Duration::from_millis(30);
+const LAST_VALUES_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// Shows the beds under `prefix`, `bed` first, until a key or `stop` ends it.
+///
+/// # Errors
+/// When the bus refuses the subscription or the terminal does not work.
+pub fn run(bus: &dyn Bus, prefix: &str, bed: Option<&str>, stop: &AtomicBool) -> io::Result<()> {
+    let dropped = Arc::new(AtomicU64::new(0));
+    let (sender, receiver) = sync_channel(QUEUE);
+    let _subscriptions = subscribe(bus, prefix, &sender, &dropped).map_err(io::Error::other)?;
+    let (last_sender, last_values) = sync_channel(1);
+    thread::scope(|scope| {
+        // Beside the screen, which does not wait for an answer that may never come.
+        scope.spawn(move || {
+            let answer = bus.last_values(&format!("{prefix}/**"), LAST_VALUES_TIMEOUT);
+            let _ = last_sender.send(answer.unwrap_or_default());
+        });
+        let feed = Feed { receiver, last_values: Some(last_values), dropped };
+        // Restores the terminal whichever way this ends.
+        let _restore = Restore;
+        let mut terminal = ratatui::try_init()?;
+        Screen { ward: Ward::new(prefix), ui: Ui::new(bed), feed, start: Instant::now() }.run(&mut terminal, stop)
+    })
+}
+
+struct Restore;
+
+impl Drop for Restore {
+    fn drop(&mut self) {
+        ratatui::restore();
+    }
+}
+
+fn subscribe(
+    bus: &dyn Bus,
+    prefix: &str,
+    sender: &SyncSender<Message>,
+    dropped: &Arc<AtomicU64>,
+) -> Result<Vec<Subscription>, BusError> {
+    let handler: Handler = {
+        let (sender, dropped) = (sender.clone(), Arc::clone(dropped));
+        Arc::new(move |message| {
+            if sender.try_send(message).is_err() {
+                dropped.fetch_add(1, Ordering::Relaxed);
+            }
+        })
+    };
+    TOPICS.iter().map(|topic| bus.subscribe(&format!("{prefix}/*/{topic}"), Arc::clone(&handler))).collect()
+}
+
+/// Where messages come from.
+struct Feed {
+    receiver: Receiver<Message>,
+    /// The answer to the request for last values, until it is there.
+    last_values: Option<Receiver<Vec<Message>>>,
+    dropped: Arc<AtomicU64>,
+}
+
+struct Screen {
+    ward: Ward,
+    ui: Ui,
+    feed: Feed,
+    start: Instant,
+}
+
+impl Screen {
+    fn run(&mut self, terminal: &mut DefaultTerminal, stop: &AtomicBool) -> io::Result<()> {
+        while !stop.load(Ordering::Relaxed) {
+            let frame_start = Instant::now();
+            self.take_messages(frame_start);
+            let now = self.start.elapsed();
+            terminal.draw(|frame| view::draw(frame, &self.ward, &self.ui, now))?;
+            if self.obey_keys(frame_start)? == Next::Quit {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    fn take_messages(&mut self, frame_start: Instant) {
+        self.ui.is_connecting = self.feed.last_values.is_some();
+        self.ui.dropped = self.feed.dropped.load(Ordering::Relaxed);
+        if let Some(last_values) = &self.feed.last_values {
+            // News waits for the last values: what is older must come first.
+            let messages = match last_values.try_recv() {
+                Err(TryRecvError::Empty) => return,
+                answer => answer.unwrap_or_default(),
+            };
+            for message in messages {
+                self.ward.apply_last_value(&message);
+            }
+            self.feed.last_values = None;
+        }
+        while frame_start.elapsed() < SHARE {
+            let Ok(message) = self.feed.receiver.try_recv() else { break };
+            self.ward.apply(&message, self.start.elapsed());
+        }
+    }
+
+    /// Obeys keys until the next picture is due.
+    fn obey_keys(&mut self, frame_start: Instant) -> io::Result<Next> {
+        loop {
+            let left = FRAME.saturating_sub(frame_start.elapsed());
+            if !event::poll(left)? {
+                return Ok(Next::Continue);
+            }
+            if let Event::Key(key) = event::read()? {
+                if self.ui.press(key, &self.ward, self.start.elapsed()) == Next::Quit {
+                    return Ok(Next::Quit);
+                }
+            } else {
+                return Ok(Next::Continue);
+            }
+        }
+    }
+}

@@ -1,0 +1,344 @@
+//! The panels of numbers: parameters, the quantities not drawn as waveforms, health, events.
+
+use std::time::Duration;
+
+use ratatui::buffer::Buffer;
+use ratatui::layout::Rect;
+use ratatui::text::{Line, Span};
+
+use super::paper::{DOTS_X, DOTS_Y, Ink, Raster, panel, put, put_right};
+use super::style;
+use super::traces::reading;
+use super::ui::{Group, Ui};
+use super::ward::{Bed, Parameter, Ward, quantity_names, seconds};
+use crate::edge::wire::{ChannelStatus, Status};
+
+/// Below this the gauge of a band says nothing.
+const LEAST_GAUGE: u16 = 8;
+/// From this on there is room for a gauge and a trend side by side.
+const GAUGE_AND_TREND: u16 = 26;
+/// Innovations beyond this factor of what is expected are marked.
+const MISFIT: f64 = 1.5;
+/// A parameter that the data have said nothing about for so long is marked \[s\].
+const UNINFORMED_AFTER_S: f64 = 5.0;
+/// Status is sent once a second; older than this, it is marked.
+const STATUS_OVERDUE: Duration = Duration::from_secs(3);
+
+/// A parameter as text.
+struct ParameterText {
+    name: String,
+    mean: String,
+    band: String,
+    truth: String,
+}
+
+impl ParameterText {
+    fn new(parameter: &Parameter, truth: Option<f64>) -> Self {
+        let Parameter { mean, low, high, .. } = *parameter;
+        let digits = style::decimals(mean, 0.5 * (high - low));
+        let number = |value| style::number(value, digits);
+        Self {
+            name: parameter.name.clone(),
+            mean: number(mean),
+            band: format!("[{}, {}]", number(low), number(high)),
+            truth: truth.map(|v| format!("◆{}", number(v))).unwrap_or_default(),
+        }
+    }
+}
+
+/// Widest of some texts.
+fn widest<'a>(texts: impl Iterator<Item = &'a String>) -> usize {
+    texts.map(|text| text.chars().count()).max().unwrap_or(0)
+}
+
+/// Rows that the parameters need, one or two each, with the title.
+pub(super) fn parameter_rows(bed: &Bed, rows_each: u16) -> u16 {
+    1 + rows_each * u16::try_from(bed.parameters.len().max(1)).unwrap_or(u16::MAX)
+}
+
+/// Name, mean, band, truth, and where there is room a gauge of the band and the trend.
+pub(super) fn draw_parameters(buf: &mut Buffer, area: Rect, bed: &Bed, rows_each: u16) {
+    let title = vec![Span::styled("parameters", style::STRONG), Span::styled(" mean [5 %, 95 %]", style::QUIET)];
+    let inner = panel(buf, area, title);
+    if bed.parameters.is_empty() {
+        put(buf, inner, 0, Span::styled("none published", style::QUIET));
+        return;
+    }
+    let truth = |p: &Parameter| bed.true_parameters.get(p.name.as_str()).copied();
+    let texts: Vec<_> = bed.parameters.iter().map(|p| ParameterText::new(p, truth(p))).collect();
+    let columns = [
+        widest(texts.iter().map(|t| &t.name)),
+        widest(texts.iter().map(|t| &t.mean)),
+        widest(texts.iter().map(|t| &t.band)),
+        widest(texts.iter().map(|t| &t.truth)),
+    ];
+    let fit = usize::from(inner.height / rows_each);
+    let shown = if fit < texts.len() { fit.saturating_sub(1) } else { texts.len() };
+    for (row, (parameter, text)) in (0..).zip(bed.parameters.iter().zip(&texts).take(shown)) {
+        let block = Rect { y: inner.y + row * rows_each, height: rows_each, ..inner };
+        draw_parameter(buf, block, (parameter, text), truth(parameter), columns);
+    }
+    if shown < texts.len() {
+        let row = rows_each * u16::try_from(shown).unwrap_or(u16::MAX);
+        put(buf, inner, row, Span::styled(format!("+{} more", texts.len() - shown), style::QUIET));
+    }
+}
+
+fn draw_parameter(
+    buf: &mut Buffer,
+    area: Rect,
+    (parameter, text): (&Parameter, &ParameterText),
+    truth: Option<f64>,
+    [name, mean, band, true_value]: [usize; 4],
+) {
+    let mut spans = vec![
+        Span::styled(format!("{:<name$} ", text.name), style::INFERRED),
+        Span::styled(format!("{:>mean$} ", text.mean), style::STRONG),
+        Span::styled(format!("{:>band$} ", text.band), style::PLAIN),
+    ];
+    let without_truth = name + mean + band + 3;
+    let is_truth_inline = without_truth + true_value <= usize::from(area.width);
+    if is_truth_inline {
+        spans.push(Span::styled(format!("{:<true_value$} ", text.truth), style::TRUTH));
+    }
+    put(buf, area, 0, Line::from(spans));
+    let used = if is_truth_inline { without_truth + true_value + usize::from(true_value > 0) } else { without_truth };
+    let used = u16::try_from(used).unwrap_or(u16::MAX).min(area.width);
+    let rest = Rect { x: area.x + used, width: area.width - used, ..area };
+    if area.height == 1 {
+        draw_beside(buf, rest, parameter, truth);
+        return;
+    }
+    let mut below = Rect { y: area.y + 1, height: 1, ..area };
+    if rest.width >= LEAST_GAUGE + 4 {
+        draw_trend(buf, rest, parameter);
+        below.width = used.saturating_sub(1);
+    }
+    let (unit, look) = if parameter.since_informed_s > UNINFORMED_AFTER_S {
+        (format!("no news {}", style::duration(parameter.since_informed_s)), style::WARNING)
+    } else {
+        (parameter.unit.to_owned(), style::QUIET)
+    };
+    let unit_width = unit.chars().count() as u16 + 1;
+    put(buf, below, 0, Span::styled(unit, look));
+    if !is_truth_inline {
+        put_right(buf, below, 0, Span::styled(text.truth.clone(), style::TRUTH));
+        below.width = below.width.saturating_sub(true_value as u16 + 1);
+    }
+    let shift = unit_width.min(below.width);
+    let gauge = Rect { x: below.x + shift, width: below.width - shift, ..below };
+    draw_gauge(buf, gauge, parameter, truth);
+}
+
+fn draw_beside(buf: &mut Buffer, area: Rect, parameter: &Parameter, truth: Option<f64>) {
+    if area.width >= GAUGE_AND_TREND {
+        let width = area.width / 2;
+        draw_gauge(buf, Rect { width: width - 1, ..area }, parameter, truth);
+        draw_trend(buf, Rect { x: area.x + width, width: area.width - width, ..area }, parameter);
+    } else {
+        draw_gauge(buf, area, parameter, truth);
+    }
+}
+
+/// Lowest and highest value of a parameter lately, its present ones and its truth included.
+fn range(parameter: &Parameter, truth: Option<f64>) -> Option<(f64, f64)> {
+    let trend = parameter.trend.since(i64::MIN).flat_map(|(_, b)| [f64::from(b.low), f64::from(b.high)]);
+    let all = trend.chain([parameter.low, parameter.high]).chain(truth).filter(|v| v.is_finite());
+    let (low, high) = all.fold((f64::MAX, f64::MIN), |(low, high), v| (low.min(v), high.max(v)));
+    (low < high).then_some((low, high))
+}
+
+/// The band on an axis as wide as the bands of the trend: `··━━●━━◆··`.
+fn draw_gauge(buf: &mut Buffer, area: Rect, parameter: &Parameter, truth: Option<f64>) {
+    let Some((low, high)) = range(parameter, truth) else { return };
+    if area.width < LEAST_GAUGE || area.height == 0 {
+        return;
+    }
+    let cell = |v: f64| ((v - low) / (high - low) * f64::from(area.width - 1)).round();
+    let at = |v: f64, column: u16| v.is_finite() && (cell(v) - f64::from(column)).abs() < 0.5;
+    for column in 0..area.width {
+        let is_within = (cell(parameter.low)..=cell(parameter.high)).contains(&f64::from(column));
+        let (symbol, look) = match () {
+            () if truth.is_some_and(|v| at(v, column)) => ("◆", style::TRUTH),
+            () if at(parameter.mean, column) => ("●", style::STRONG),
+            () if is_within => ("━", style::INFERRED),
+            () => ("·", style::RULE),
+        };
+        put(buf, Rect { x: area.x + column, width: 1, ..area }, 0, Span::styled(symbol, look));
+    }
+}
+
+/// Mean and band of the last two minutes.
+fn draw_trend(buf: &mut Buffer, area: Rect, parameter: &Parameter) {
+    let (Some((low, high)), Some(newest_ns)) = (range(parameter, None), parameter.trend.newest_ns()) else { return };
+    let oldest_ns = parameter.trend.since(i64::MIN).next().map_or(newest_ns, |(t, _)| t);
+    let (dots_x, dots_y) = (i64::from(area.width * DOTS_X), f64::from(area.height * DOTS_Y));
+    let span_s = seconds(newest_ns.saturating_sub(oldest_ns)).max(1.0);
+    let mut raster = Raster::new(area.width, area.height);
+    let y = |v: f32| ((high - f64::from(v)) / (high - low) * (dots_y - 1.0)).round() as i64;
+    let mut drawn = -1;
+    for (t, band) in parameter.trend.since(i64::MIN) {
+        let x = (seconds(t.saturating_sub(oldest_ns)) / span_s * (dots_x - 1) as f64) as i64;
+        for column in drawn + 1..=x {
+            raster.column(Ink::Band, column, y(band.high), y(band.low));
+            raster.set(Ink::Mean, column, y(band.mean));
+        }
+        drawn = drawn.max(x);
+    }
+    raster.paint(buf, area, |ink| if ink == Ink::Mean { style::INFERRED } else { style::RULE });
+}
+
+/// Rows of [`draw_values`].
+pub(super) const VALUE_ROWS: u16 = 7;
+
+/// The two groups that are not drawn as waveforms, side by side.
+pub(super) fn draw_values(buf: &mut Buffer, area: Rect, bed: &Bed, drawn: Group) {
+    const WIDTH_WITH_TRUTH: u16 = 27;
+    let others: Vec<Group> = Group::ALL.into_iter().filter(|g| *g != drawn).collect();
+    let width = area.width / 2;
+    let truth = bed.truth.since(i64::MAX).last().map(|(_, row)| row);
+    for (column, group) in (0..).zip(others) {
+        let half = Rect { x: area.x + column * width, width: width.max(1), ..area };
+        let title = vec![Span::styled(group.name(), style::STRONG), Span::styled(format!(" {}", group.unit()), style::QUIET)];
+        let inner = panel(buf, half, title);
+        for (row, quantity) in (0..).zip(group.quantities()) {
+            let name = quantity_names().nth(quantity).unwrap_or_default();
+            let band = bed.state.as_ref().map(|(_, state)| state.bands[quantity]);
+            let (mean, half) = band.map_or((style::NONE.to_owned(), String::new()), reading);
+            let mut spans = vec![
+                Span::styled(format!("{name:<5}"), style::INFERRED),
+                Span::styled(format!("{mean:>5}"), style::STRONG),
+                Span::styled(format!("{half:<6}"), style::QUIET),
+            ];
+            if let Some(truth) = truth.map(|row| f64::from(row[quantity])).filter(|_| width >= WIDTH_WITH_TRUTH) {
+                spans.push(Span::styled(format!(" ◆{}", style::number(truth, 1)), style::TRUTH));
+            }
+            put(buf, inner, row, Line::from(spans));
+        }
+    }
+}
+
+/// Text of labels and values: labels quiet, values plain, those that worry marked.
+#[derive(Default)]
+struct Facts(Vec<Span<'static>>);
+
+impl Facts {
+    fn add(mut self, label: &'static str, value: impl Into<String>, worries: bool) -> Self {
+        let gap = if self.0.is_empty() { "" } else { " " };
+        self.0.push(Span::styled(format!("{gap}{label} "), style::QUIET));
+        let value = if worries { format!("{}!", value.into()) } else { value.into() };
+        self.0.push(Span::styled(value, if worries { style::WARNING } else { style::PLAIN }));
+        self
+    }
+
+    fn line(self) -> Line<'static> {
+        Line::from(self.0)
+    }
+}
+
+/// The health of the estimator and of this screen, most important first.
+pub(super) fn health(bed: &Bed, ward: &Ward, ui: &Ui, now: Duration) -> Vec<Line<'static>> {
+    let mut lines = Vec::new();
+    match &bed.status {
+        None => lines.push(Line::styled("no status yet", style::QUIET)),
+        Some(status) => {
+            lines.extend(solver_health(status));
+            lines.extend(status.channels.iter().map(|c| channel_health(c, status)));
+            lines.extend(counters(&status.counters));
+        }
+    }
+    if let Some(age) = bed.status_arrival.map(|at| now.saturating_sub(at)).filter(|age| *age > STATUS_OVERDUE) {
+        let text = format!("status {} old!", style::duration(age.as_secs_f64()));
+        lines.insert(0, Line::styled(text, style::WARNING));
+    }
+    let screen = [("dropped", ui.dropped), ("unreadable", ward.unreadable), ("beds refused", ward.refused)];
+    for (what, n) in screen.into_iter().filter(|(_, n)| *n > 0) {
+        lines.push(Facts::default().add("this screen:", format!("{} {what}", style::count(n)), true).line());
+    }
+    lines
+}
+
+fn solver_health(status: &Status) -> Vec<Line<'static>> {
+    let ms = |value: f64| style::number(value, if value < 9.995 { 2 } else { usize::from(value < 99.95) });
+    vec![
+        Facts::default()
+            .add("members", format!("{}/{}", status.members_alive, status.members), status.members_alive < status.members)
+            .add("windows", style::count(status.windows), false)
+            .line(),
+        Facts::default()
+            .add("lag p50", ms(status.lag_p50_ms), false)
+            .add("p99", ms(status.lag_p99_ms), false)
+            .add("max", ms(status.lag_max_ms), false)
+            .line(),
+        Facts::default()
+            .add("solve", ms(status.solve_ms), false)
+            .add("queue", status.queue_depth.to_string(), false)
+            .add("no data", style::count(status.windows_without_data), false)
+            .line(),
+        Facts::default()
+            .add("not converged", style::count(status.not_converged), status.not_converged > 0)
+            .add("iter", style::number(status.iterations, 1), false)
+            .line(),
+    ]
+}
+
+fn channel_health(channel: &ChannelStatus, status: &Status) -> Line<'static> {
+    let is_live = channel.state == "live";
+    let silence_s = seconds(status.header.time_ns.saturating_sub(channel.last_sample_ns));
+    let state = match channel.state.as_str() {
+        "silent" => format!("silent {}", style::duration(silence_s)),
+        other => other.to_owned(),
+    };
+    let rms = channel.innovation_rms;
+    let mut spans = vec![
+        Span::styled(format!("{:<5}", channel.name), style::OBSERVED),
+        Span::styled(format!("{state:<7}"), if is_live { style::PLAIN } else { style::WARNING }),
+    ];
+    let fit = Facts::default().add("fit rms", style::number(rms, 2), rms > MISFIT);
+    spans.extend(fit.add("n", style::count(channel.samples_used), false).0);
+    Line::from(spans)
+}
+
+/// Causes and counts, as many per line as a narrow panel takes.
+fn counters(counters: &[(String, u64)]) -> Vec<Line<'static>> {
+    const LINE: usize = 30;
+    let mut lines: Vec<String> = Vec::new();
+    for (cause, n) in counters {
+        let text = format!("{cause} {}", style::count(*n));
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + text.chars().count() + 2 <= LINE => {
+                line.push_str("  ");
+                line.push_str(&text);
+            }
+            _ => lines.push(text),
+        }
+    }
+    lines.into_iter().map(|line| Line::styled(line, style::WARNING)).collect()
+}
+
+/// Writes the health lines.
+pub(super) fn draw_health(buf: &mut Buffer, area: Rect, lines: Vec<Line<'static>>) {
+    let inner = panel(buf, area, vec![Span::styled("health", style::STRONG), Span::styled(" lag, solve in ms", style::QUIET)]);
+    for (row, line) in (0..inner.height).zip(lines) {
+        put(buf, inner, row, line);
+    }
+}
+
+/// The newest events, the newest of all at the bottom.
+pub(super) fn draw_events(buf: &mut Buffer, area: Rect, bed: &Bed) {
+    let inner = panel(buf, area, vec![Span::styled("events", style::STRONG)]);
+    if bed.events.is_empty() {
+        put(buf, inner, 0, Span::styled("none", style::QUIET));
+    }
+    let first = bed.events.len().saturating_sub(usize::from(inner.height));
+    for (row, event) in (0..).zip(bed.events.range(first..)) {
+        let is_good = matches!(event.kind.as_str(), "start" | "recovered");
+        let spans = vec![
+            Span::styled(format!("{:>9}  ", super::style::event_time(event.time_ns)), style::QUIET),
+            Span::styled(event.kind.clone(), if is_good { style::OBSERVED } else { style::WARNING }),
+            Span::styled(format!(" {}", event.channel), style::STRONG),
+            Span::styled(format!("  {}", event.text), style::PLAIN),
+        ];
+        put(buf, inner, row, Line::from(spans));
+    }
+}

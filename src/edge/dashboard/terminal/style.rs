@@ -1,0 +1,107 @@
+//! Colours and numbers.
+//!
+//! Colours are the Okabe-Ito set, nearest of the 256 that every terminal has, on black; none carries a meaning
+//! that a word or a shape does not carry as well.
+
+use ratatui::style::{Color, Modifier, Style};
+
+pub(super) const BACKGROUND: Color = Color::Indexed(16);
+const WHITE: Color = Color::Indexed(254);
+const GREY: Color = Color::Indexed(246);
+const DARK_GREY: Color = Color::Indexed(240);
+const SKY_BLUE: Color = Color::Indexed(81);
+const BLUISH_GREEN: Color = Color::Indexed(43);
+const ORANGE: Color = Color::Indexed(214);
+const YELLOW: Color = Color::Indexed(227);
+
+pub(super) const SCREEN: Style = Style::new().fg(WHITE).bg(BACKGROUND);
+pub(super) const BOLD: Style = Style::new().add_modifier(Modifier::BOLD);
+pub(super) const STRONG: Style = Style::new().fg(WHITE).add_modifier(Modifier::BOLD);
+pub(super) const PLAIN: Style = Style::new().fg(WHITE);
+pub(super) const QUIET: Style = Style::new().fg(GREY);
+pub(super) const RULE: Style = Style::new().fg(DARK_GREY);
+pub(super) const OBSERVED: Style = Style::new().fg(BLUISH_GREEN);
+pub(super) const INFERRED: Style = Style::new().fg(SKY_BLUE);
+pub(super) const BAND: Style = Style::new().fg(Color::Indexed(242));
+pub(super) const SAMPLE: Style = Style::new().fg(WHITE);
+pub(super) const TRUTH: Style = Style::new().fg(ORANGE).add_modifier(Modifier::BOLD);
+pub(super) const WARNING: Style = Style::new().fg(YELLOW).add_modifier(Modifier::BOLD);
+pub(super) const ALARM: Style = Style::new().fg(BACKGROUND).bg(YELLOW).add_modifier(Modifier::BOLD);
+pub(super) const GOOD: Style = Style::new().fg(BACKGROUND).bg(BLUISH_GREEN).add_modifier(Modifier::BOLD);
+pub(super) const KEY: Style = Style::new().fg(BACKGROUND).bg(GREY);
+
+/// What stands in place of a number that is not there.
+pub(super) const NONE: &str = "–";
+
+/// Digits after the point that make `value` readable to two digits of `resolution`, and no longer than needed.
+pub(super) fn decimals(value: f64, resolution: f64) -> usize {
+    let magnitude = |v: f64| if v.is_finite() && v.abs() > 0.0 { v.abs().log10().floor() } else { 0.0 };
+    let by_resolution = if resolution.is_finite() && resolution > 0.0 { 1.0 - magnitude(resolution) } else { 3.0 };
+    let by_length = 3.0 - magnitude(value);
+    by_resolution.min(by_length.max(0.0)).clamp(0.0, 5.0) as usize
+}
+
+/// A number with so many digits after the point; huge ones in powers of ten.
+pub(super) fn number(value: f64, decimals: usize) -> String {
+    match value {
+        v if !v.is_finite() => NONE.to_owned(),
+        v if v.abs() >= 1e6 => format!("{v:.1e}"),
+        v => format!("{v:.decimals$}"),
+    }
+}
+
+/// A count in at most five characters.
+pub(super) fn count(n: u64) -> String {
+    match n as f64 {
+        _ if n < 100_000 => n.to_string(),
+        v if v < 1e6 => format!("{:.0}k", v / 1e3),
+        v if v < 1e9 => format!("{:.1}M", v / 1e6),
+        v if v < 1e12 => format!("{:.1}G", v / 1e9),
+        v => format!("{v:.0e}"),
+    }
+}
+
+/// A duration \[s\] in a few characters.
+pub(super) fn duration(seconds: f64) -> String {
+    match seconds {
+        s if !s.is_finite() => NONE.to_owned(),
+        s if s < 10.0 => format!("{s:.1} s"),
+        s if s < 120.0 => format!("{s:.0} s"),
+        s if s < 7200.0 => format!("{:.0} min", s / 60.0),
+        s => format!("{:.0} h", s / 3600.0),
+    }
+}
+
+/// Event time: of day if it counts from 1970, else seconds since whatever it counts from.
+pub(super) fn event_time(time_ns: i64) -> String {
+    const YEAR_2001_NS: i64 = 1_000_000_000_000_000_000;
+    if time_ns < YEAR_2001_NS {
+        return format!("{:.1} s", super::ward::seconds(time_ns));
+    }
+    let tenths = time_ns / 100_000_000;
+    let (second, tenth) = (tenths / 10 % 86_400, tenths % 10);
+    format!("{:02}:{:02}:{:02}.{tenth} UTC", second / 3600, second / 60 % 60, second % 60)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_are_as_long_as_their_band_is_wide() {
+        let shown = |value: f64, half: f64| number(value, decimals(value, half));
+        assert_eq!(shown(0.08, 0.0043), "0.0800");
+        assert_eq!(shown(1.6, 0.21), "1.60");
+        assert_eq!(shown(72.0, 0.000_1), "72.00");
+        assert_eq!(shown(3001.4, 12.0), "3001");
+        assert_eq!(shown(f64::NAN, 1.0), NONE);
+        assert_eq!(shown(1e300, 1.0), "1.0e300");
+    }
+
+    #[test]
+    fn event_time_is_of_day_or_since_the_start() {
+        assert_eq!(event_time(12_340_000_000), "12.3 s");
+        assert_eq!(event_time(1_700_000_000_500_000_000), "22:13:20.5 UTC");
+        assert_eq!(event_time(i64::MIN), "-9223372036.9 s");
+    }
+}

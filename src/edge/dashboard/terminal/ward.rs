@@ -1,0 +1,485 @@
+//! What the screen knows: the beds heard so far and the recent past of each.
+//!
+//! Nothing here grows without a limit, whatever arrives: beds, rows, names and texts are capped, and what cannot
+//! be understood is counted. Time is an argument.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::time::Duration;
+
+use super::history::{History, Limits};
+use crate::edge::bus::{Encoding, Message};
+use crate::edge::wire::{
+    self, ChannelStatus, Event, PARAMETER_STATISTICS, ParameterEstimate, PressureBlock, STATE_STATISTICS,
+    StateEstimate, Status, Truth,
+};
+use crate::model::cvsim6::{FlowsAndVolumes, PARAMETERS, Pressures};
+
+/// Beds that are shown; further ones are counted.
+pub(super) const MAX_BEDS: usize = 1000;
+/// Pressures, flows and volumes.
+pub(super) const QUANTITIES: usize = Pressures::LEN + FlowsAndVolumes::LEN;
+/// Nothing for this long, and a bed is stale.
+pub(super) const STALE_AFTER: Duration = Duration::from_secs(2);
+/// An estimate this long without data is called a forecast \[s\].
+pub(super) const FORECAST_AFTER_S: f64 = 0.25;
+
+/// Longest past of the waveforms \[s\].
+pub(super) const HISTORY_S: i64 = 60;
+const NS_PER_S: i64 = 1_000_000_000;
+/// 8 ms, finer than a dot of the widest terminal at a few seconds across.
+const SPACING_NS: i64 = NS_PER_S / 125;
+/// Rows of all beds together: about 80 MB.
+const ROW_BUDGET: usize = 200_000;
+/// The trend of a parameter: two minutes of seconds.
+const TREND: Limits = Limits { age_ns: 120 * NS_PER_S, spacing_ns: NS_PER_S, rows: 121 };
+const MAX_PARAMETERS: usize = 64;
+const MAX_EVENTS: usize = 200;
+const MAX_STATUS_ENTRIES: usize = 32;
+const MAX_TEXT: usize = 200;
+const MAX_NAME: usize = 40;
+
+/// Monitor labels of the six pressures, apart from their own names.
+const LABELS: [&[&str]; Pressures::LEN] =
+    [&["lvp"], &["abp", "art", "aobp", "uap"], &["cvp"], &["rvp"], &["pap"], &["lap"]];
+
+/// A mean and the 5 and 95 % quantiles; `f32` because a screen has few dots.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Band {
+    pub(super) mean: f32,
+    pub(super) low: f32,
+    pub(super) high: f32,
+}
+
+/// All quantities at one time.
+#[derive(Debug, Clone)]
+pub(super) struct StateRow {
+    /// NaN where not published.
+    pub(super) bands: [Band; QUANTITIES],
+    /// Seconds since data entered the estimate.
+    pub(super) since_data_s: f64,
+}
+
+/// An estimated parameter, now and lately.
+#[derive(Debug, Clone)]
+pub(super) struct Parameter {
+    pub(super) name: String,
+    pub(super) unit: &'static str,
+    pub(super) mean: f64,
+    pub(super) low: f64,
+    pub(super) high: f64,
+    /// Seconds since the data last said something about it.
+    pub(super) since_informed_s: f64,
+    pub(super) trend: History<Band>,
+}
+
+/// A line of the event log.
+#[derive(Debug, Clone)]
+pub(super) struct EventLine {
+    pub(super) time_ns: i64,
+    pub(super) sequence: u64,
+    pub(super) kind: String,
+    pub(super) channel: String,
+    pub(super) text: String,
+}
+
+/// Where a pressure comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Origin {
+    /// A sensor delivers it.
+    Observed,
+    /// It has a sensor that does not deliver at present.
+    Silent,
+    /// No sensor.
+    Inferred,
+}
+
+/// Whether what is shown is the present.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Liveness {
+    /// Estimates arrive; the last was made this long after its data \[s\].
+    Live {
+        /// As in [`StateRow::since_data_s`].
+        since_data_s: f64,
+    },
+    /// Pressures arrive, estimates do not.
+    NoEstimate,
+    /// Nothing has arrived for this long.
+    Stale(Duration),
+    /// Only values from before this screen was opened.
+    NotHeard,
+}
+
+/// One bed.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Bed {
+    /// The newest estimate in event time.
+    pub(super) state: Option<(i64, StateRow)>,
+    pub(super) history: History<StateRow>,
+    /// Raw samples of the six pressures.
+    pub(super) samples: [History<f32>; Pressures::LEN],
+    /// What a synthetic patient really is; NaN where not published.
+    pub(super) truth: History<[f32; QUANTITIES]>,
+    pub(super) true_parameters: BTreeMap<&'static str, f64>,
+    pub(super) parameters: Vec<Parameter>,
+    pub(super) status: Option<Status>,
+    pub(super) events: VecDeque<EventLine>,
+    estimate_arrival: Option<Duration>,
+    sample_arrival: Option<Duration>,
+    pub(super) status_arrival: Option<Duration>,
+}
+
+/// All beds under a prefix.
+#[derive(Debug)]
+pub(super) struct Ward {
+    prefix: String,
+    pub(super) beds: BTreeMap<String, Bed>,
+    /// Messages of the kinds shown here.
+    pub(super) messages: u64,
+    /// Of these, not understood.
+    pub(super) unreadable: u64,
+    /// Of these, from beds beyond [`MAX_BEDS`].
+    pub(super) refused: u64,
+}
+
+/// A message that passed every check of its shape.
+enum Content {
+    State(StateEstimate),
+    Parameters(ParameterEstimate),
+    Status(Status),
+    Event(Event),
+    Truth(Truth),
+    Samples(usize, PressureBlock),
+}
+
+/// Names of the quantities in their order here.
+pub(super) fn quantity_names() -> impl Iterator<Item = &'static str> {
+    Pressures::NAMES.iter().chain(FlowsAndVolumes::NAMES).copied()
+}
+
+fn quantity(name: &str) -> Option<usize> {
+    quantity_names().position(|n| n == name)
+}
+
+fn channel(label: &str) -> Option<usize> {
+    let by_label = || LABELS.iter().position(|labels| labels.iter().any(|l| l.eq_ignore_ascii_case(label)));
+    Pressures::NAMES.iter().position(|n| *n == label).or_else(by_label)
+}
+
+/// The statistic `name` in one row of a table of `names`.
+fn statistic(names: &[&str], row: &[f64], name: &str) -> f64 {
+    names.iter().zip(row).find(|(n, _)| **n == name).map_or(f64::NAN, |(_, value)| *value)
+}
+
+impl Band {
+    fn from_row(names: &[&str], row: &[f64]) -> Self {
+        let narrow = |name| statistic(names, row, name) as f32;
+        Self { mean: narrow("mean"), low: narrow("q05"), high: narrow("q95") }
+    }
+}
+
+/// Text of others: short, and without what could steer the terminal.
+fn tame(text: &str, longest: usize) -> String {
+    text.chars().take(longest).map(|c| if c.is_control() { ' ' } else { c }).collect()
+}
+
+impl Content {
+    /// `None` for topics that are not shown.
+    fn read(topic: &str, message: &Message) -> Option<Result<Self, ()>> {
+        let Message { payload, encoding, .. } = message;
+        if let Some(label) = topic.strip_prefix("pressure/") {
+            let channel = channel(label)?;
+            return Some(wire::decode(payload, *encoding).map(|b| Self::Samples(channel, b)).map_err(drop));
+        }
+        if *encoding != Encoding::Bincode {
+            return None;
+        }
+        let read = match topic {
+            "estimate/state" => wire::decode(payload, *encoding).map(Self::State),
+            "estimate/parameters" => wire::decode(payload, *encoding).map(Self::Parameters),
+            "status" => wire::decode(payload, *encoding).map(Self::Status),
+            "event" => wire::decode(payload, *encoding).map(Self::Event),
+            "truth" => wire::decode(payload, *encoding).map(Self::Truth),
+            _ => return None,
+        };
+        Some(read.ok().filter(Self::is_consistent).ok_or(()))
+    }
+
+    /// Whether the lengths of the tables agree.
+    fn is_consistent(&self) -> bool {
+        let product = |a: usize, b: usize| a.checked_mul(b);
+        match self {
+            Self::State(s) => {
+                let cells = product(s.times_ns.len(), s.names.len()).and_then(|n| product(n, STATE_STATISTICS.len()));
+                cells == Some(s.values.len()) && s.since_data_s.len() == s.times_ns.len() && !s.names.is_empty()
+            }
+            Self::Parameters(p) => product(p.names.len(), PARAMETER_STATISTICS.len()) == Some(p.values.len()),
+            Self::Truth(t) => t.names.len() == t.values.len(),
+            Self::Samples(_, b) => b.offsets_ns.is_empty() || b.offsets_ns.len() == b.values.len(),
+            Self::Status(_) | Self::Event(_) => true,
+        }
+    }
+}
+
+impl Ward {
+    /// An empty ward; `prefix` is the common start of the keys.
+    pub(super) fn new(prefix: &str) -> Self {
+        let prefix = prefix.trim_end_matches('/').to_owned();
+        Self { prefix, beds: BTreeMap::new(), messages: 0, unreadable: 0, refused: 0 }
+    }
+
+    /// Takes in a message that arrived just now.
+    pub(super) fn apply(&mut self, message: &Message, now: Duration) {
+        self.take(message, Some(now));
+    }
+
+    /// Takes in a value from before: it is shown, but is no sign of life.
+    pub(super) fn apply_last_value(&mut self, message: &Message) {
+        self.take(message, None);
+    }
+
+    fn take(&mut self, message: &Message, arrival: Option<Duration>) {
+        let below_prefix = message.key.strip_prefix(&self.prefix).and_then(|rest| rest.strip_prefix('/'));
+        let Some((name, topic)) = below_prefix.and_then(|rest| rest.split_once('/')) else { return };
+        let Some(content) = Content::read(topic, message) else { return };
+        self.messages += 1;
+        // Read before the bed is made: noise under a new name is no bed.
+        let Ok(content) = content else {
+            self.unreadable += 1;
+            return;
+        };
+        let name = tame(name, MAX_NAME);
+        let is_new = !self.beds.contains_key(&name);
+        if is_new && self.beds.len() >= MAX_BEDS {
+            self.refused += 1;
+            return;
+        }
+        let beds = self.beds.len() + usize::from(is_new);
+        self.beds.entry(name).or_default().take(content, arrival, waveform_limits(beds));
+    }
+
+    /// Where `bed` stands among the beds in order of name, counted from 0.
+    pub(super) fn position(&self, bed: &str) -> Option<usize> {
+        self.beds.keys().position(|name| name == bed)
+    }
+
+    /// The common start of the keys.
+    pub(super) fn prefix(&self) -> &str {
+        &self.prefix
+    }
+}
+
+/// The limits of the waveforms, given how many beds share the memory.
+fn waveform_limits(beds: usize) -> Limits {
+    let longest = usize::try_from(HISTORY_S * NS_PER_S / SPACING_NS).unwrap_or(usize::MAX);
+    let rows = longest.min(ROW_BUDGET / beds.max(1));
+    Limits { age_ns: HISTORY_S * NS_PER_S, spacing_ns: SPACING_NS, rows }
+}
+
+impl Bed {
+    fn take(&mut self, content: Content, arrival: Option<Duration>, limits: Limits) {
+        match content {
+            Content::State(state) => {
+                self.estimate_arrival = arrival.or(self.estimate_arrival);
+                self.take_state(&state, limits);
+            }
+            Content::Samples(channel, block) => {
+                self.sample_arrival = arrival.or(self.sample_arrival);
+                self.take_samples(channel, &block, limits);
+            }
+            Content::Parameters(parameters) => self.take_parameters(&parameters),
+            Content::Truth(truth) => self.take_truth(&truth, limits),
+            Content::Status(status) => {
+                self.status_arrival = arrival.or(self.status_arrival);
+                self.status = Some(tame_status(status));
+            }
+            Content::Event(event) => self.take_event(&event),
+        }
+    }
+
+    fn take_state(&mut self, state: &StateEstimate, limits: Limits) {
+        let columns: Vec<Option<usize>> = state.names.iter().map(|name| quantity(name)).collect();
+        let rows = state.values.chunks(state.names.len() * STATE_STATISTICS.len());
+        for ((&time_ns, &since_data_s), row) in state.times_ns.iter().zip(&state.since_data_s).zip(rows) {
+            let mut bands = [Band { mean: f32::NAN, low: f32::NAN, high: f32::NAN }; QUANTITIES];
+            for (column, statistics) in columns.iter().zip(row.chunks(STATE_STATISTICS.len())) {
+                if let Some(q) = column {
+                    bands[*q] = Band::from_row(&STATE_STATISTICS, statistics);
+                }
+            }
+            let row = StateRow { bands, since_data_s };
+            self.history.push(time_ns, row.clone(), limits);
+            // The history thins out and forgets after a jump back: its end decides what is newest.
+            if self.history.newest_ns().is_none_or(|newest| time_ns >= newest) {
+                self.state = Some((time_ns, row));
+            }
+        }
+    }
+
+    fn take_samples(&mut self, channel: usize, block: &PressureBlock, limits: Limits) {
+        for (i, value) in block.values.iter().enumerate() {
+            let regular = || block.period_ns.saturating_mul(i64::try_from(i).unwrap_or(i64::MAX));
+            let offset_ns = block.offsets_ns.get(i).copied().unwrap_or_else(regular);
+            self.samples[channel].push(block.start_ns.saturating_add(offset_ns), *value as f32, limits);
+        }
+    }
+
+    fn take_parameters(&mut self, estimate: &ParameterEstimate) {
+        let rows = estimate.values.chunks(PARAMETER_STATISTICS.len());
+        for (name, row) in estimate.names.iter().zip(rows).take(MAX_PARAMETERS) {
+            let name = tame(name, MAX_NAME);
+            let known = self.parameters.iter().position(|p| p.name == name);
+            if known.is_none() && self.parameters.len() >= MAX_PARAMETERS {
+                continue;
+            }
+            let at = known.unwrap_or_else(|| {
+                self.parameters.push(Parameter::new(name));
+                self.parameters.len() - 1
+            });
+            self.parameters[at].update(estimate.header.time_ns, row);
+        }
+    }
+
+    fn take_truth(&mut self, truth: &Truth, limits: Limits) {
+        let mut row = [f32::NAN; QUANTITIES];
+        for (name, value) in truth.names.iter().zip(&truth.values) {
+            if let Some(q) = quantity(name) {
+                row[q] = *value as f32;
+            } else if let Some(parameter) = PARAMETERS.iter().find(|p| p.name == name) {
+                self.true_parameters.insert(parameter.name, *value);
+            }
+        }
+        if row.iter().any(|v| v.is_finite()) {
+            self.truth.push(truth.time_ns, row, limits);
+        }
+    }
+
+    fn take_event(&mut self, event: &Event) {
+        let (time_ns, sequence) = (event.header.time_ns, event.header.sequence);
+        // A last value may arrive a second time as news.
+        if self.events.iter().any(|e| e.time_ns == time_ns && e.sequence == sequence) {
+            return;
+        }
+        let [kind, channel] = [&event.kind, &event.channel].map(|s| tame(s, MAX_NAME));
+        self.events.push_back(EventLine { time_ns, sequence, kind, channel, text: tame(&event.text, MAX_TEXT) });
+        if self.events.len() > MAX_EVENTS {
+            self.events.pop_front();
+        }
+    }
+
+    /// Whether what is shown is the present.
+    pub(super) fn liveness(&self, now: Duration) -> Liveness {
+        let is_recent = |arrival: Duration| now.saturating_sub(arrival) < STALE_AFTER;
+        let newest = self.estimate_arrival.max(self.sample_arrival);
+        match (newest, self.estimate_arrival) {
+            (_, Some(estimate)) if is_recent(estimate) => {
+                let since_data_s = self.state.as_ref().map_or(0.0, |(_, row)| row.since_data_s);
+                Liveness::Live { since_data_s }
+            }
+            (Some(newest), _) if is_recent(newest) => Liveness::NoEstimate,
+            (Some(newest), _) => Liveness::Stale(now.saturating_sub(newest)),
+            (None, _) => Liveness::NotHeard,
+        }
+    }
+
+    /// Time since an estimate (or, without any, a sample) arrived.
+    pub(super) fn age(&self, now: Duration) -> Option<Duration> {
+        self.estimate_arrival.or(self.sample_arrival).map(|arrival| now.saturating_sub(arrival))
+    }
+
+    /// The event time at the right edge of the picture.
+    pub(super) fn newest_ns(&self, now: Duration) -> Option<i64> {
+        let sample = || self.samples.iter().filter_map(History::newest_ns).max();
+        let estimate = self.state.as_ref().map(|(t, _)| *t);
+        match self.liveness(now) {
+            // The silence of the estimator must be seen as a gap.
+            Liveness::NoEstimate => sample().max(estimate),
+            _ => estimate.or_else(sample),
+        }
+    }
+
+    /// Where a quantity comes from; flows and volumes have no sensors.
+    pub(super) fn origin(&self, quantity: usize) -> Origin {
+        let Some(samples) = self.samples.get(quantity) else { return Origin::Inferred };
+        let listed = self.status.as_ref().and_then(|s| s.channels.iter().find(|c| channel(&c.name) == Some(quantity)));
+        match listed.map(|c| c.state.as_str()) {
+            Some("live") => Origin::Observed,
+            Some(_) => Origin::Silent,
+            None if self.status.is_some() || samples.newest_ns().is_none() => Origin::Inferred,
+            None => Origin::Observed,
+        }
+    }
+
+    /// Beats per minute: estimated, or else counted on the left ventricle.
+    pub(super) fn heart_rate_bpm(&self) -> Option<f64> {
+        let estimated = self.parameters.iter().find(|p| p.name == "heart_rate").map(|p| p.mean);
+        estimated.or_else(|| self.counted_beats_bpm())
+    }
+
+    fn counted_beats_bpm(&self) -> Option<f64> {
+        const LOOK_BACK_S: i64 = 10;
+        const LEAST_SWING_MMHG: f32 = 10.0;
+        let from_ns = self.history.newest_ns()?.saturating_sub(LOOK_BACK_S * NS_PER_S);
+        let left_ventricle = quantity("p_l")?;
+        let means = || self.history.since(from_ns).map(|(t, row)| (t, row.bands[left_ventricle].mean));
+        let (low, high) = means().fold((f32::MAX, f32::MIN), |(low, high), (_, p)| (low.min(p), high.max(p)));
+        if high - low < LEAST_SWING_MMHG {
+            return None;
+        }
+        // Two thresholds, so that ripples on one are not beats.
+        let (armed_below, counted_above) = (low + 0.3 * (high - low), low + 0.6 * (high - low));
+        let (mut armed, mut onsets) = (false, Vec::new());
+        for (time_ns, p) in means() {
+            if p < armed_below {
+                armed = true;
+            } else if armed && p > counted_above {
+                armed = false;
+                onsets.push(time_ns);
+            }
+        }
+        let (first, last) = (onsets.first()?, onsets.last()?);
+        (onsets.len() > 2).then(|| 60.0 * (onsets.len() - 1) as f64 / seconds(last - first))
+    }
+
+    /// Largest and smallest mean of a quantity over the last two beats.
+    pub(super) fn extremes(&self, quantity: usize) -> Option<(f32, f32)> {
+        const WITHOUT_RATE_S: f64 = 2.0;
+        let look_back_s = self.heart_rate_bpm().map_or(WITHOUT_RATE_S, |bpm| (120.0 / bpm).clamp(0.5, 6.0));
+        let from_ns = self.history.newest_ns()?.saturating_sub((look_back_s * 1e9) as i64);
+        let means = self.history.since(from_ns).map(|(_, row)| row.bands[quantity].mean).filter(|p| p.is_finite());
+        let (low, high) = means.fold((f32::MAX, f32::MIN), |(low, high), p| (low.min(p), high.max(p)));
+        (low <= high).then_some((high, low))
+    }
+}
+
+impl Parameter {
+    fn new(name: String) -> Self {
+        let unit = PARAMETERS.iter().find(|p| p.name == name).map_or("", |p| p.unit);
+        let [mean, low, high, since_informed_s] = [f64::NAN; 4];
+        Self { name, unit, mean, low, high, since_informed_s, trend: History::default() }
+    }
+
+    fn update(&mut self, time_ns: i64, row: &[f64]) {
+        let fields = ["mean", "q05", "q95", "since_informed_s"];
+        let [mean, low, high, since_informed_s] = fields.map(|name| statistic(&PARAMETER_STATISTICS, row, name));
+        self.trend.push(time_ns, Band::from_row(&PARAMETER_STATISTICS, row), TREND);
+        let (name, unit, trend) = (std::mem::take(&mut self.name), self.unit, std::mem::take(&mut self.trend));
+        *self = Self { name, unit, mean, low, high, since_informed_s, trend };
+    }
+}
+
+fn tame_status(mut status: Status) -> Status {
+    status.counters.truncate(MAX_STATUS_ENTRIES);
+    status.channels.truncate(MAX_STATUS_ENTRIES);
+    for (name, _) in &mut status.counters {
+        *name = tame(name, MAX_NAME);
+    }
+    for ChannelStatus { name, state, .. } in &mut status.channels {
+        (*name, *state) = (tame(name, MAX_NAME), tame(state, MAX_NAME));
+    }
+    status
+}
+
+/// Nanoseconds as seconds.
+pub(super) fn seconds(ns: i64) -> f64 {
+    ns as f64 * 1e-9
+}
