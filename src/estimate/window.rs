@@ -200,7 +200,9 @@ impl WindowCutter {
                 Err(refusal) => result.refused[refusal as usize] += 1,
             }
         }
-        if result.kept > 0 {
+        // Late samples count as well: a channel that always comes a little after the others would stay silent for
+        // ever if windows did not begin to wait for it again.
+        if result.kept > 0 || result.refused[Refusal::Late as usize] > 0 {
             let liveness = &mut self.channels[channel].liveness;
             result.recovered = *liveness == Liveness::Silent;
             *liveness = Liveness::Live;

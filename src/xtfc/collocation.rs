@@ -33,6 +33,8 @@ pub struct CollocationSolver {
     step_xi: Vec<f64>,
     /// Physics residual after a full step.
     predicted: Vec<f64>,
+    /// Whether the step was shortened to its limits.
+    limited: bool,
     /// See [`Solution::innovations`].
     innovations: Vec<(f64, f64)>,
 }
@@ -113,6 +115,7 @@ impl CollocationSolver {
 
     /// The Gauss-Newton step into `step_beta`, `step_xi`, and the physics residual it predicts.
     fn full_step<M: Model>(&mut self, problem: &WindowProblem<'_, M>) {
+        self.limited = false;
         resize(&mut self.step_xi, problem.prior.n_xi);
         resize(&mut self.predicted, self.point.physics.len());
         if !problem.data.is_empty() {
@@ -183,7 +186,7 @@ impl CollocationSolver {
             }
         }
         self.step_xi.iter_mut().zip(&self.point.xi).for_each(|(s, xi)| *s -= xi);
-        limit_step(problem, &mut self.step_xi);
+        self.limited = limit_step(problem, &mut self.step_xi);
     }
 
     /// Moves along the step, shortened while the objective grows; true if the linearisation was right.
@@ -201,7 +204,8 @@ impl CollocationSolver {
             }
             share *= 0.5;
         }
-        let converged = share > 0.75 && self.agrees(problem, share);
+        // A limited step is no minimiser, however well it was predicted.
+        let converged = !self.limited && share > 0.75 && self.agrees(problem, share);
         std::mem::swap(&mut self.point, &mut self.trial);
         converged
     }
@@ -236,8 +240,8 @@ fn evaluate<M: Model>(point: &mut Point, problem: &WindowProblem<'_, M>, phi: &[
     point.evaluate_physics(problem);
 }
 
-/// Shortens the step in `xi` so that no coordinate moves by more than its limit.
-pub(super) fn limit_step<M>(problem: &WindowProblem<'_, M>, step_xi: &mut [f64]) {
+/// Shortens the step in `xi` so that no coordinate moves by more than its limit; true if it had to.
+pub(super) fn limit_step<M>(problem: &WindowProblem<'_, M>, step_xi: &mut [f64]) -> bool {
     let unknowns = problem.unknowns;
     let first = if unknowns.initial_state { problem.start.len() } else { 0 };
     let mut share = 1.0_f64;
@@ -251,6 +255,7 @@ pub(super) fn limit_step<M>(problem: &WindowProblem<'_, M>, step_xi: &mut [f64])
     if share < 1.0 {
         step_xi.iter_mut().for_each(|s| *s *= share);
     }
+    share < 1.0
 }
 
 /// `A`, block by block of states that the model couples somewhere in the window.

@@ -40,11 +40,12 @@ pub fn solve<M: Model>(problem: &WindowProblem<'_, M>, out: &mut Solution) {
             break;
         }
         let n_beta = point.beta.len();
-        limit_step(problem, &mut step[n_beta..]);
+        let limited = limit_step(problem, &mut step[n_beta..]);
         let next = take_step(&point, problem, &phi, &step);
         // At a kink (a valve at rest) no step gets small, but none gains anything either.
         let (before, after) = (point.objective(problem), next.objective(problem));
-        account.converged = step_is_small(problem, &step, n_beta) || (before - after).abs() <= NO_GAIN * before;
+        let no_gain = (before - after).abs() <= NO_GAIN * before;
+        account.converged = !limited && (step_is_small(problem, &step, n_beta) || no_gain);
         point = next;
     }
     point.finish(problem, account, out);

@@ -1,8 +1,11 @@
 //! All integration tests, one binary: linking zenoh once is enough.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::float_cmp, missing_docs, unreachable_pub)]
 
+mod cli;
 mod config;
+mod kalman;
 mod model;
 mod support;
+mod tidy;
 mod twin;
 mod xtfc;

@@ -113,39 +113,113 @@ impl Run {
     }
 }
 
+/// Scenario 6 of the paper from a 50 % wrong start. One run says little about coverage (the error of the blood volume
+/// hardly changes within it), so it is judged over runs.
 #[test]
-#[ignore]
-fn explore() {
-    let seeds: u64 = std::env::var("SEEDS").map_or(4, |v| v.parse().unwrap());
-    let get = |name: &str, default: f64| std::env::var(name).map_or(default, |v| v.parse().unwrap());
-    let run_one = |seed: u64| {
-        let mut s = settings(CouplingKind::Coupled, &[State::A, State::Pa], &[Parameter::RPv, Parameter::CA]);
-        s.drift = Drift { parameters: get("PD", 0.02), pressures_mmhg: get("XD", 0.01), inflation: get("INF", 1.0) };
-        s.window.length_ns = (get("H", 0.005) * 1e9) as i64;
-        s.seed = seed;
-        s.members = get("M", 100.0) as usize;
-        let start = std::time::Instant::now();
-        let run = watch(&s, get("T", 30.0), 200.0, 100 + seed);
+fn coupled_finds_resistance_and_compliance_from_two_channels() {
+    let model = Cvsim6::default();
+    let seeds = 6;
+    let mut mean_coverage = [0.0; 6];
+    for seed in 0..seeds {
+        let mut settings =
+            settings(CouplingKind::Coupled, &[State::A, State::Pa], &[Parameter::RPv, Parameter::CA]);
+        settings.seed = seed;
+        let run = watch(&settings, 5.0, 200.0, 50 + seed);
         let last = run.estimates.last().unwrap();
-        let p: Vec<f64> = last.parameters.iter().map(|(p, _)| p.summary.mean / Cvsim6::default().parameters()[p.parameter].default).collect();
-        let cov: Vec<f64> = last.parameters.iter().map(|(p,_)| p.summary.sd/p.summary.mean).collect();
-        let at5 = run.estimates.iter().find(|e| e.time.as_s() > 5.0).unwrap();
-        let p5: Vec<f64> = at5.parameters.iter().map(|(p, _)| p.summary.mean / Cvsim6::default().parameters()[p.parameter].default).collect();
-        (run.score(0.0), run.score(5.0), p, cov, p5, start.elapsed().as_secs_f64())
-    };
-    let results: Vec<_> = std::thread::scope(|scope| {
-        let handles: Vec<_> = (0..2).map(|w| scope.spawn(move || (0..seeds).filter(|s| s % 2 == w).map(run_one).collect::<Vec<_>>())).collect();
-        handles.into_iter().flat_map(|h| h.join().unwrap()).collect()
-    });
-    for (all, late, p, cov, p5, wall) in &results {
-        print!("rmse "); late[..6].iter().for_each(|(r, _)| print!("{r:.3} "));
-        print!("| cov all "); all[..6].iter().for_each(|(_, c)| print!("{:.0} ", 100.0 * c));
-        print!("| late "); late[..6].iter().for_each(|(_, c)| print!("{:.0} ", 100.0 * c));
-        println!("| p5 {p5:.3?} p {p:.3?} sd {cov:.3?} wall {wall:.1}");
+        for (p, _) in &last.parameters {
+            let off = p.summary.mean / model.parameters()[p.parameter].default - 1.0;
+            let name = model.parameters()[p.parameter].name;
+            println!("seed {seed} {name}: {:+.1} % (sd {:.1} %)", 100.0 * off, 100.0 * p.summary.sd / p.summary.mean);
+            assert!(off.abs() < 0.05, "seed {seed}, parameter {name}: {off}");
+            assert!(p.identifiability > 0.95, "learnt from data: {}", p.identifiability);
+        }
+        for (q, (rmse, coverage)) in run.score(1.0).iter().enumerate().take(6) {
+            println!("seed {seed} state {q}: rms {rmse:.3} mmHg, coverage {coverage:.2}");
+            assert!(*rmse < NOISE[q], "seed {seed} state {q}: {rmse}");
+            mean_coverage[q] += coverage / seeds as f64;
+        }
     }
-    for q in 0..18 {
-        let mean: f64 = results.iter().map(|r| r.1[q].1).sum::<f64>() / results.len() as f64;
-        print!("{:.1} ", 100.0 * mean);
+    println!("coverage over runs: {mean_coverage:.2?}");
+    // Nominal 0.9; the assumed drift, which this truth does not have, makes for a little more.
+    assert!(mean_coverage.iter().all(|c| (0.8..=1.0).contains(c)), "{mean_coverage:.2?}");
+}
+
+/// The paper's own coupling on the paper's own setting, scenario 1: the band is wide because the data cannot correct
+/// the blood volume, and the parameter is still found.
+#[test]
+fn independent_finds_the_resistance_and_keeps_the_spread_of_its_start() {
+    use State::{A, L, Pa, Pv, R, V};
+    let mut settings = settings(CouplingKind::Independent, &[L, A, V, R, Pa, Pv], &[Parameter::RPv]);
+    settings.members = 20;
+    settings.window.length_ns = 1_000_000;
+    let run = watch(&settings, 3.0, 1000.0, 5);
+    let last = run.estimates.last().unwrap();
+    let (r_pv, _) = last.parameters[0];
+    let truth = Cvsim6::default().parameters()[r_pv.parameter].default;
+    assert!((r_pv.summary.mean / truth - 1.0).abs() < 0.1, "{}", r_pv.summary.mean / truth);
+    let p_a = last.quantities[A as usize];
+    assert!(p_a.epistemic_sd > 0.3, "{p_a:?}");
+    assert!((p_a.aleatoric_sd - NOISE[A as usize]).abs() < 1e-12);
+    assert!((p_a.sd.powi(2) - p_a.epistemic_sd.powi(2) - p_a.aleatoric_sd.powi(2)).abs() < 1e-9);
+}
+
+/// All sixteen physical parameters and the intrathoracic pressure at once: bounded, finite, and the data still fit.
+#[test]
+fn every_parameter_can_be_estimated() {
+    let model = Cvsim6::default();
+    let all: Vec<usize> =
+        (0..model.parameters().len()).filter(|&p| model.parameters()[p].estimable).collect();
+    assert_eq!(all.len(), 18, "sixteen physical ones, p_th and the beat phase");
+    let mut settings = settings(CouplingKind::Coupled, &[State::A, State::V, State::Pa], &[]);
+    settings.estimate = all.clone();
+    settings.initial_guess_sd = 0.05;
+    settings.members = 60;
+    settings.theta[Parameter::RPv as usize] *= 1.1;
+    let run = watch(&settings, 2.0, 125.0, 9);
+    let last = run.estimates.last().unwrap();
+    assert_eq!(last.parameters.len(), all.len());
+    for (p, _) in &last.parameters {
+        let (low, high) = model.parameters()[p.parameter].bounds;
+        assert!(p.summary.q05 >= low && p.summary.q95 <= high && p.summary.sd.is_finite());
     }
-    println!();
+    let (rmse, _) = run.score(1.0)[State::A as usize];
+    assert!(rmse < NOISE[State::A as usize], "{rmse}");
+}
+
+/// Without samples an estimate is a forecast: it says so, and its band grows.
+#[test]
+fn a_gap_is_forecast_with_growing_bands() {
+    let mut settings = settings(CouplingKind::Coupled, &[State::A, State::Pa], &[Parameter::RPv]);
+    settings.members = 40;
+    let model = Cvsim6::default();
+    let theta = model.default_parameters();
+    let mut patient = Simulator::new(model, Cvsim6::initial_pressures(&theta).unwrap(), theta, vec![]);
+    let mut estimator = Estimator::new(model, settings).unwrap();
+    let mut outputs = Vec::new();
+    for k in 0..=600_u32 {
+        let t = f64::from(k) * 0.005;
+        patient.advance_to(t).unwrap();
+        let now = ArrivalTime(ns_from_s(t));
+        // Both channels are gone from 1 to 3 s.
+        if !(1.0..3.0).contains(&t) {
+            for (channel, state) in [(0, State::A), (1, State::Pa)] {
+                let value = patient.state()[state as usize];
+                let samples = vec![RawSample { time: EventTime::from_s(t), value }];
+                estimator.handle(Input::Samples { channel, samples }, now, &Serial, &mut outputs);
+            }
+        }
+        estimator.handle(Input::Tick, now, &Serial, &mut outputs);
+    }
+    let estimates: Vec<&Estimate> =
+        outputs.iter().filter_map(|o| if let Output::Estimate(e) = o { Some(e) } else { None }).collect();
+    // The same phase of the beat, before the gap and at its end (72 bpm).
+    let at = |t: f64| estimates.iter().find(|e| (e.time.as_s() - t).abs() < 1e-6).unwrap();
+    let (before, late) = (at(0.98), at(2.64));
+    assert!(before.since_data_ns < 10_000_000, "{}", before.since_data_ns);
+    assert!((late.since_data_ns - 1_645_000_000).abs() < 10_000_000, "{}", late.since_data_ns);
+    let band = |e: &Estimate, s: State| e.quantities[s as usize].q95 - e.quantities[s as usize].q05;
+    assert!(band(late, State::A) > band(before, State::A), "the band grows without data");
+    let gaps = outputs.iter().filter(|o| matches!(o, Output::Notice(n) if n.kind.name() == "gap")).count();
+    let back = outputs.iter().filter(|o| matches!(o, Output::Notice(n) if n.kind.name() == "recovered")).count();
+    assert_eq!((gaps, back), (2, 2));
 }
