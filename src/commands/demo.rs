@@ -60,7 +60,8 @@ impl Demo {
         let sets: Vec<String> = SETTINGS.iter().map(|s| (*s).to_owned()).chain(self.sets.iter().cloned()).collect();
         let (mut config, _) = Config::load(None, &sets)?;
         config.zenoh = ZenohSettings { mode: ZenohMode::Peer, listen: vec![free_endpoint()?], connect: Vec::new() };
-        let client = ZenohSettings { mode: ZenohMode::Client, listen: Vec::new(), connect: config.zenoh.listen.clone() };
+        let client =
+            ZenohSettings { mode: ZenohMode::Client, listen: Vec::new(), connect: config.zenoh.listen.clone() };
 
         let stop = Arc::new(AtomicBool::new(false));
         let runtime = tokio_runtime()?;
@@ -135,7 +136,8 @@ fn subscribe(bus: &ZenohBus, config: &Config) -> Result<(Subscription, Receiver<
 
 /// The daemon's subscription takes a moment to get here; what is published before is lost.
 fn wait_for_listener(bus: &ZenohBus, config: &Config) {
-    let key = format!("{}/{BED}/pressure/{}", config.publish.prefix, config.observed.first().map_or("", String::as_str));
+    let key =
+        format!("{}/{BED}/pressure/{}", config.publish.prefix, config.observed.first().map_or("", String::as_str));
     for _ in 0..100 {
         if bus.is_wanted(&key) {
             return;
@@ -171,7 +173,12 @@ fn lines(board: &Shared, ended: &AtomicBool) {
             .iter()
             .map(|(name, mean, q05, q95, truth)| format!("{name} {mean:.4} [{q05:.4} {q95:.4}] true {truth:.4}"))
             .collect();
-        say(format!("{:6.2} s  {}  |  {}", estimate.header.time_ns as f64 * 1e-9, pressures.join("  "), parameters.join("  ")));
+        say(format!(
+            "{:6.2} s  {}  |  {}",
+            estimate.header.time_ns as f64 * 1e-9,
+            pressures.join("  "),
+            parameters.join("  ")
+        ));
     }
 }
 

@@ -99,7 +99,8 @@ impl Run {
             let expected = config.observed.join(", ");
             return Err(Failure::Input(format!("no column of the record is observed, expected one of {expected}")));
         }
-        let progress = if std::io::stderr().is_terminal() { ProgressBar::new(whole(seconds)) } else { ProgressBar::hidden() };
+        let progress =
+            if std::io::stderr().is_terminal() { ProgressBar::new(whole(seconds)) } else { ProgressBar::hidden() };
         let style = ProgressStyle::with_template("{bar:40} {pos}/{len} s  {eta} left");
         progress.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
         Ok(Self {
@@ -153,7 +154,13 @@ impl Run {
                     self.notices += 1;
                     let (channel, model) = (notice.channel, self.estimator.model());
                     let name = channel.map_or("", |c| model.states()[self.estimator.settings().channels[c].state].name);
-                    tracing::info!(time_s = notice.time.as_s(), channel = name, "{}: {}", notice.kind.name(), notice.kind.text());
+                    tracing::info!(
+                        time_s = notice.time.as_s(),
+                        channel = name,
+                        "{}: {}",
+                        notice.kind.name(),
+                        notice.kind.text()
+                    );
                 }
             }
         }

@@ -15,8 +15,10 @@ use super::{ConfigArgs, Failure, log_to_stderr, say};
 
 /// Publish a patient, synthetic or recorded, at its own pace
 #[derive(Args)]
-#[command(after_help = "Examples:  hemostream replay --config config/patients/pulmonary_hypertension.toml\n           \
-                        hemostream replay --record observed.csv --speed 4 --bed icu-7")]
+#[command(
+    after_help = "Examples:  hemostream replay --config config/patients/pulmonary_hypertension.toml\n           \
+                        hemostream replay --record observed.csv --speed 4 --bed icu-7"
+)]
 pub(crate) struct Replay {
     #[command(flatten)]
     config: ConfigArgs,
@@ -82,7 +84,12 @@ impl Replay {
         });
         let settings = client_settings(&config, &self.connect);
         let bus = runtime.block_on(async { ZenohBus::open(&settings) })?;
-        say(format!("publishing {} bed(s) under {}/ to {}", self.beds, config.publish.prefix, settings.connect.join(", ")));
+        say(format!(
+            "publishing {} bed(s) under {}/ to {}",
+            self.beds,
+            config.publish.prefix,
+            settings.connect.join(", ")
+        ));
         let seconds = run(&bus, &config, &options, &mut beds, &stop)?;
         bus.close();
         say(format!("published {seconds:.1} patient-seconds"));

@@ -11,8 +11,10 @@ use super::{ConfigArgs, Failure, failed};
 
 /// Write a synthetic record: the truth, and what noisy sensors see of it
 #[derive(Args)]
-#[command(after_help = "Example:  hemostream simulate --config config/patients/pulmonary_hypertension.toml \\\n            \
-                        --seconds 30 --rate-hz 200 --truth truth.csv --observed observed.csv")]
+#[command(
+    after_help = "Example:  hemostream simulate --config config/patients/pulmonary_hypertension.toml \\\n            \
+                        --seconds 30 --rate-hz 200 --truth truth.csv --observed observed.csv"
+)]
 pub(crate) struct Simulate {
     #[command(flatten)]
     config: ConfigArgs,

@@ -113,9 +113,7 @@ pub fn matches(pattern: &str, key: &str) -> bool {
 }
 
 pub(crate) fn check_key(key: &str) -> Result<(), BusError> {
-    keyexpr::new(key)
-        .map(|_| ())
-        .map_err(|error| BusError::Key { key: key.to_owned(), reason: error.to_string() })
+    keyexpr::new(key).map(|_| ()).map_err(|error| BusError::Key { key: key.to_owned(), reason: error.to_string() })
 }
 
 /// Handlers of a [`MemoryBus`].

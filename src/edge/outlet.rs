@@ -124,7 +124,10 @@ impl Outlet {
         let lost = match delivery {
             Delivery::Events => queue.send((message, delivery)).is_err(),
             Delivery::Samples | Delivery::Estimates => {
-                matches!(queue.try_send((message, delivery)), Err(TrySendError::Full(_) | TrySendError::Disconnected(_)))
+                matches!(
+                    queue.try_send((message, delivery)),
+                    Err(TrySendError::Full(_) | TrySendError::Disconnected(_))
+                )
             }
         };
         if lost {

@@ -58,7 +58,15 @@ pub struct ReplayOptions {
 
 impl Default for ReplayOptions {
     fn default() -> Self {
-        Self { rate_hz: 200.0, speed: 1.0, seconds: None, block_s: 0.01, start_s: 0.0, truth_rate_hz: 50.0, repeat: false }
+        Self {
+            rate_hz: 200.0,
+            speed: 1.0,
+            seconds: None,
+            block_s: 0.01,
+            start_s: 0.0,
+            truth_rate_hz: 50.0,
+            repeat: false,
+        }
     }
 }
 

@@ -1,9 +1,7 @@
 //! From the configuration to what the core wants to know.
 
 use super::config::{self, Config, ConfigError};
-use crate::estimate::settings::{
-    ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
-};
+use crate::estimate::settings::{ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings};
 use crate::estimate::time::ns_from_s;
 use crate::model::Model;
 use crate::model::cvsim6::{Cvsim6, Pressures};

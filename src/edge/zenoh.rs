@@ -57,9 +57,9 @@ impl ZenohBus {
         ] {
             config.insert_json5(key, value).map_err(|e| transport(format!("{key} = {value}: {e}")))?;
         }
-        let session = zenoh::open(config).wait().map_err(|e| {
-            transport(format!("cannot open a session (listen {listen}, connect {connect}): {e}"))
-        })?;
+        let session = zenoh::open(config)
+            .wait()
+            .map_err(|e| transport(format!("cannot open a session (listen {listen}, connect {connect}): {e}")))?;
         Ok(Self { session, publishers: Arc::default() })
     }
 

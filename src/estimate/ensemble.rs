@@ -247,7 +247,8 @@ impl<M: Model> Ensemble<M> {
 
     /// Moves the members on, mends those without numbers, and sums up.
     fn account(&mut self, observations: usize) -> WindowReport {
-        let mut report = WindowReport { solved: self.members.iter().filter(|m| m.solved).count(), ..Default::default() };
+        let mut report =
+            WindowReport { solved: self.members.iter().filter(|m| m.solved).count(), ..Default::default() };
         let h = s_from_ns(self.settings.window.length_ns);
         let parameters = self.model.parameters();
         let mut squares = 0.0;
@@ -513,9 +514,7 @@ pub fn with_companions<M: Model>(model: &M, estimate: &[usize]) -> Vec<usize> {
 
 fn draw_bases(settings: &EstimatorSettings, rng: &mut ChaCha8Rng) -> Result<Vec<Basis>, SettingsError> {
     let length_s = s_from_ns(settings.window.length_ns);
-    (0..settings.members)
-        .map(|_| Ok(Basis::new(RandomFeatures::draw(settings.features, rng)?, length_s)?))
-        .collect()
+    (0..settings.members).map(|_| Ok(Basis::new(RandomFeatures::draw(settings.features, rng)?, length_s)?)).collect()
 }
 
 /// `rows x columns` standard normals, row-major; every row is centred, its variance kept at 1.

@@ -4,9 +4,7 @@
 
 use std::collections::BTreeMap;
 
-use super::ensemble::{
-    Ensemble, Observation, Parallel, ParameterSummary, Snapshot, WindowReport, with_companions,
-};
+use super::ensemble::{Ensemble, Observation, Parallel, ParameterSummary, Snapshot, WindowReport, with_companions};
 use super::settings::{EstimatorSettings, SettingsError};
 use super::statistics::Summary;
 use super::time::{ArrivalTime, EventTime, NS_PER_S};

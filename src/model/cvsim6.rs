@@ -125,23 +125,75 @@ named_vector! {
 const STATES: &[Quantity] = &[mmhg("p_l"), mmhg("p_a"), mmhg("p_v"), mmhg("p_r"), mmhg("p_pa"), mmhg("p_pv")];
 
 const DERIVED: &[Quantity] = &[
-    flow("q_li"), flow("q_lo"), flow("q_a"), flow("q_ri"), flow("q_ro"), flow("q_pv"),
-    volume("v_l"), volume("v_a"), volume("v_v"), volume("v_r"), volume("v_pa"), volume("v_pv"),
+    flow("q_li"),
+    flow("q_lo"),
+    flow("q_a"),
+    flow("q_ri"),
+    flow("q_ro"),
+    flow("q_pv"),
+    volume("v_l"),
+    volume("v_a"),
+    volume("v_v"),
+    volume("v_r"),
+    volume("v_pa"),
+    volume("v_pv"),
 ];
 
 /// The parameter table: defaults of the paper, converted from Ba to mmHg.
 pub const PARAMETERS: &[ParameterInfo] = &[
-    ParameterInfo { name: "heart_rate", unit: "bpm", default: 72.0, bounds: (20.0, 300.0), transform: Transform::Log, estimable: true },
-    ParameterInfo { name: "systole", unit: "s, fraction or s^0.5", default: 0.33, bounds: (0.02, 0.66), transform: Transform::Log, estimable: true },
-    ParameterInfo { name: "p_th", unit: "mmHg", default: -4.0, bounds: (-40.0, 40.0), transform: Transform::Linear { scale: 4.0 }, estimable: true },
-    capacitance("c_l_dia", 7.50e-3), capacitance("c_l_sys", 3.00e-4), capacitance("c_a", 1.20e-3), capacitance("c_v", 7.50e-2),
-    capacitance("c_r_dia", 1.50e-2), capacitance("c_r_sys", 9.00e-4), capacitance("c_pa", 3.23e-3), capacitance("c_pv", 6.30e-3),
-    resistance("r_li", 13.33), resistance("r_lo", 8.00), resistance("r_a", 1333.22),
-    resistance("r_ri", 66.66), resistance("r_ro", 4.00), resistance("r_pv", 106.66),
-    fixed_volume("v0_l", 15.0), fixed_volume("v0_a", 715.0), fixed_volume("v0_v", 2500.0),
-    fixed_volume("v0_r", 15.0), fixed_volume("v0_pa", 90.0), fixed_volume("v0_pv", 490.0),
+    ParameterInfo {
+        name: "heart_rate",
+        unit: "bpm",
+        default: 72.0,
+        bounds: (20.0, 300.0),
+        transform: Transform::Log,
+        estimable: true,
+    },
+    ParameterInfo {
+        name: "systole",
+        unit: "s, fraction or s^0.5",
+        default: 0.33,
+        bounds: (0.02, 0.66),
+        transform: Transform::Log,
+        estimable: true,
+    },
+    ParameterInfo {
+        name: "p_th",
+        unit: "mmHg",
+        default: -4.0,
+        bounds: (-40.0, 40.0),
+        transform: Transform::Linear { scale: 4.0 },
+        estimable: true,
+    },
+    capacitance("c_l_dia", 7.50e-3),
+    capacitance("c_l_sys", 3.00e-4),
+    capacitance("c_a", 1.20e-3),
+    capacitance("c_v", 7.50e-2),
+    capacitance("c_r_dia", 1.50e-2),
+    capacitance("c_r_sys", 9.00e-4),
+    capacitance("c_pa", 3.23e-3),
+    capacitance("c_pv", 6.30e-3),
+    resistance("r_li", 13.33),
+    resistance("r_lo", 8.00),
+    resistance("r_a", 1333.22),
+    resistance("r_ri", 66.66),
+    resistance("r_ro", 4.00),
+    resistance("r_pv", 106.66),
+    fixed_volume("v0_l", 15.0),
+    fixed_volume("v0_a", 715.0),
+    fixed_volume("v0_v", 2500.0),
+    fixed_volume("v0_r", 15.0),
+    fixed_volume("v0_pa", 90.0),
+    fixed_volume("v0_pv", 490.0),
     fixed_volume("blood_volume", 5000.0),
-    ParameterInfo { name: "beat_phase", unit: "beats", default: 0.0, bounds: (-1e9, 1e9), transform: Transform::Linear { scale: 1.0 }, estimable: true },
+    ParameterInfo {
+        name: "beat_phase",
+        unit: "beats",
+        default: 0.0,
+        bounds: (-1e9, 1e9),
+        transform: Transform::Linear { scale: 1.0 },
+        estimable: true,
+    },
 ];
 
 const fn mmhg(name: &'static str) -> Quantity {
@@ -388,8 +440,12 @@ impl Cvsim6 {
         // Total volume at the end of diastole.
         let unstressed = theta.v0_l + theta.v0_a + theta.v0_v + theta.v0_r + theta.v0_pa + theta.v0_pv;
         let stores = [
-            (l_dia, theta.c_l_dia, theta.p_th), (a, theta.c_a, theta.p_th / 3.0), (v, theta.c_v, 0.0),
-            (r_dia, theta.c_r_dia, theta.p_th), (pa, theta.c_pa, theta.p_th), (pv, theta.c_pv, theta.p_th),
+            (l_dia, theta.c_l_dia, theta.p_th),
+            (a, theta.c_a, theta.p_th / 3.0),
+            (v, theta.c_v, 0.0),
+            (r_dia, theta.c_r_dia, theta.p_th),
+            (pa, theta.c_pa, theta.p_th),
+            (pv, theta.c_pv, theta.p_th),
         ];
         b[7] = theta.blood_volume - unstressed;
         for (column, c, reference) in stores {
@@ -557,10 +613,7 @@ impl Moment {
     fn by_timing(&self, f: &Pressures, beat_time: f64, systole: f64) -> Pressures {
         let combine = |c: &Capacitance| {
             let (t, s) = (c.by_time(), c.by_systolic_time());
-            ValueAndRate {
-                value: t.value * beat_time + s.value * systole,
-                rate: t.rate * beat_time + s.rate * systole,
-            }
+            ValueAndRate { value: t.value * beat_time + s.value * systole, rate: t.rate * beat_time + s.rate * systole }
         };
         Pressures {
             p_l: self.left_by(f, combine(&self.c_l)),

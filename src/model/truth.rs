@@ -129,7 +129,8 @@ impl<M: Model> Simulator<M> {
         self.theta[parameter] = value;
         // What was integrated ahead is no longer true.
         let now = Step { t: 0.0, x: self.x.clone(), dx: vec![0.0; self.x.len()] };
-        self.segment = Segment { start_s: self.time_s, end_s: self.time_s, theta: self.theta.clone(), steps: vec![now] };
+        self.segment =
+            Segment { start_s: self.time_s, end_s: self.time_s, theta: self.theta.clone(), steps: vec![now] };
     }
 
     /// Integrates to `time_s`; does nothing if that is not in the future.
@@ -163,9 +164,8 @@ impl<M: Model> Simulator<M> {
         let change = self.script.front().map_or(f64::INFINITY, |c| c.at_s - self.time_s);
         let limit = MAX_SEGMENT_S.min(change);
         let span_s = self.model.next_corner(0.0, limit, &self.theta).unwrap_or(limit);
-        let steps = self
-            .solve(span_s)
-            .map_err(|reason| SimulationError { at_s: self.time_s, reason: reason.to_string() })?;
+        let steps =
+            self.solve(span_s).map_err(|reason| SimulationError { at_s: self.time_s, reason: reason.to_string() })?;
         if !steps.iter().all(|step| step.x.iter().all(|v| v.is_finite())) {
             return Err(SimulationError { at_s: self.time_s, reason: "the state is not finite".to_owned() });
         }
@@ -219,4 +219,3 @@ impl<M: Model> Simulator<M> {
         }
     }
 }
-

@@ -6,9 +6,7 @@ use hdrhistogram::Histogram;
 
 use super::clock::Clock;
 use crate::estimate::ensemble::Parallel;
-use crate::estimate::estimator::{
-    ChannelHealth, Estimator, Input, Notice, NoticeKind, Output, REPORT_EVERY_NS,
-};
+use crate::estimate::estimator::{ChannelHealth, Estimator, Input, Notice, NoticeKind, Output, REPORT_EVERY_NS};
 use crate::estimate::time::{ArrivalTime, EventTime, s_from_ns};
 use crate::estimate::window::{Liveness, RawSample};
 use crate::model::cvsim6::Cvsim6;
@@ -45,6 +43,8 @@ pub enum Task {
         queue_depth: usize,
         /// Tasks lost because too many were waiting.
         queue_full: u64,
+        /// Events of all beds lost before they got here.
+        inlet_full: u64,
     },
 }
 
@@ -154,9 +154,9 @@ impl Bed {
             }
             Task::Refused(cause) => self.refuse(cause, arrived, out),
             Task::Tick => self.drive(Input::Tick, arrived, parallel, out),
-            Task::Report { want_members, queue_depth, queue_full } => {
+            Task::Report { want_members, queue_depth, queue_full, inlet_full } => {
                 self.drive(Input::WantMembers(want_members), arrived, parallel, out);
-                return Some(self.health(queue_depth, queue_full));
+                return Some(self.health(queue_depth, &[("queue_full", queue_full), ("inlet_full", inlet_full)]));
             }
         }
         None
@@ -220,15 +220,13 @@ impl Bed {
     }
 
     #[allow(clippy::cast_precision_loss)]
-    fn health(&self, queue_depth: usize, queue_full: u64) -> Health {
-        let lag = |quantile: f64| {
-            self.lag_us.as_ref().map_or(f64::NAN, |h| h.value_at_quantile(quantile) as f64 / 1e3)
-        };
+    fn health(&self, queue_depth: usize, lost: &[(&'static str, u64)]) -> Health {
+        let lag = |quantile: f64| self.lag_us.as_ref().map_or(f64::NAN, |h| h.value_at_quantile(quantile) as f64 / 1e3);
         let members = self.estimator.settings().members;
         let mut counters = self.counters.clone();
         counters.extend(self.estimator.refused().iter().map(|(cause, n)| (cause.name(), *n)));
         counters.insert("restarts", self.estimator.restarts());
-        counters.insert("queue_full", queue_full);
+        counters.extend(lost.iter().copied());
         counters.retain(|_, n| *n > 0);
         Health {
             time: self.last_window,

@@ -113,6 +113,8 @@ pub struct Service {
     returned: mpsc::UnboundedReceiver<Event>,
     beds: BTreeMap<String, Slot>,
     too_many_beds: u64,
+    /// Events that did not fit into the queue, counted by the inlet.
+    dropped: Arc<AtomicU64>,
 }
 
 impl Service {
@@ -133,9 +135,20 @@ impl Service {
         // Unbounded in type only: there is at most one return per bed.
         let (returns, returned) = mpsc::unbounded_channel();
         let inlet = Inlet { events: sender, dropped: Arc::default() };
-        let beds = BTreeMap::new();
-        let service =
-            Self { model, settings, limits, workers, sink, clock, events, returns, returned, beds, too_many_beds: 0 };
+        let service = Self {
+            model,
+            settings,
+            limits,
+            workers,
+            sink,
+            clock,
+            events,
+            returns,
+            returned,
+            beds: BTreeMap::new(),
+            too_many_beds: 0,
+            dropped: Arc::clone(&inlet.dropped),
+        };
         Ok((service, inlet))
     }
 
@@ -265,7 +278,8 @@ impl Service {
                 continue;
             };
             let want_members = self.sink.wants_members(&name);
-            self.enqueue(&name, Task::Report { want_members, queue_depth, queue_full });
+            let inlet_full = self.dropped.load(Ordering::Relaxed);
+            self.enqueue(&name, Task::Report { want_members, queue_depth, queue_full, inlet_full });
         }
     }
 }

@@ -224,7 +224,10 @@ impl CollocationSolver {
                 let phi = &self.phi[j * nodes..(j + 1) * nodes];
                 let mut change = dot(phi, &self.step_beta[datum.state * nodes..][..nodes]);
                 if problem.unknowns.initial_state {
-                    change += dot(&problem.prior.root[datum.state * problem.prior.n_xi..][..problem.prior.n_xi], &self.step_xi);
+                    change += dot(
+                        &problem.prior.root[datum.state * problem.prior.n_xi..][..problem.prior.n_xi],
+                        &self.step_xi,
+                    );
                 }
                 let error = self.trial.data[j] - self.point.data[j] - share * datum.weight * change;
                 error.abs() <= tolerance * datum.weight

@@ -112,9 +112,7 @@ impl Nodes {
         let share = |i: usize, of: usize| i as f64 / of as f64;
         match self {
             Self::Uniform => (0..n).map(|i| share(i, n - 1)).collect(),
-            Self::Chebyshev => {
-                (0..n).map(|i| 0.5 * (1.0 - (std::f64::consts::PI * share(i, n - 1)).cos())).collect()
-            }
+            Self::Chebyshev => (0..n).map(|i| 0.5 * (1.0 - (std::f64::consts::PI * share(i, n - 1)).cos())).collect(),
             Self::Legendre => gauss_legendre(n).into_iter().map(|(x, _)| 0.5 * (1.0 + x)).collect(),
         }
     }

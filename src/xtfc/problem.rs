@@ -239,8 +239,11 @@ impl Point {
         for i in 0..n {
             let beta = &self.beta[i * rank..(i + 1) * rank];
             for node in 0..nodes {
-                let rate =
-                    if problem.basis.is_nodal() { beta[node] } else { dot(&problem.basis.rates()[node * rank..][..rank], beta) };
+                let rate = if problem.basis.is_nodal() {
+                    beta[node]
+                } else {
+                    dot(&problem.basis.rates()[node * rank..][..rank], beta)
+                };
                 self.physics[i * nodes + node] = rate - self.f[node * n + i];
             }
         }

@@ -26,8 +26,19 @@ fn path(path: &Path) -> &str {
 fn record(folder: &Path) -> (PathBuf, PathBuf) {
     let (truth, observed) = (folder.join("truth.csv"), folder.join("observed.csv"));
     let output = hemostream(&[
-        "simulate", "--seconds", "2", "--rate-hz", "200", "--truth", path(&truth), "--observed", path(&observed),
-        "--set", "observed=[\"p_a\", \"p_pa\"]", "--set", "patient.script=[{ at_s = 1.0, scale = { r_pv = 2.0 } }]",
+        "simulate",
+        "--seconds",
+        "2",
+        "--rate-hz",
+        "200",
+        "--truth",
+        path(&truth),
+        "--observed",
+        path(&observed),
+        "--set",
+        "observed=[\"p_a\", \"p_pa\"]",
+        "--set",
+        "patient.script=[{ at_s = 1.0, scale = { r_pv = 2.0 } }]",
     ]);
     assert!(output.status.success(), "{}", text(&output.stderr));
     (truth, observed)
@@ -74,8 +85,14 @@ fn estimate_is_byte_identical_on_one_and_two_threads() {
     }
     let table = read_table(&folder.path().join("coupled1.csv"));
     assert_eq!(table.rows.len(), 101, "50 Hz from 0 to 2 s");
-    assert_eq!(table.header[..8], ["time_s", "p_l_mean", "p_l_sd", "p_l_q05", "p_l_q95", "p_l_epistemic_sd", "p_l_aleatoric_sd", "p_l_model_sd"]);
-    assert_eq!(table.header[127..], ["r_pv_mean", "r_pv_sd", "r_pv_q05", "r_pv_q95", "c_a_mean", "c_a_sd", "c_a_q05", "c_a_q95"]);
+    assert_eq!(
+        table.header[..8],
+        ["time_s", "p_l_mean", "p_l_sd", "p_l_q05", "p_l_q95", "p_l_epistemic_sd", "p_l_aleatoric_sd", "p_l_model_sd"]
+    );
+    assert_eq!(
+        table.header[127..],
+        ["r_pv_mean", "r_pv_sd", "r_pv_q05", "r_pv_q95", "c_a_mean", "c_a_sd", "c_a_q05", "c_a_q95"]
+    );
     assert!(table.rows.iter().flatten().all(|v| v.is_finite()));
 }
 

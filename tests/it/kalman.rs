@@ -138,7 +138,8 @@ fn coupled_is_the_kalman_filter_of_a_linear_model() {
             for j in 0..=i {
                 let other: Vec<f64> = values.iter().skip(j).step_by(3).copied().collect();
                 let mj = other.iter().sum::<f64>() / members as f64;
-                let sample: f64 = column.iter().zip(&other).map(|(a, b)| (a - m) * (b - mj)).sum::<f64>() / (members - 1) as f64;
+                let sample: f64 =
+                    column.iter().zip(&other).map(|(a, b)| (a - m) * (b - mj)).sum::<f64>() / (members - 1) as f64;
                 let scale = (covariance[(i, i)] * covariance[(j, j)]).sqrt();
                 let error = (sample - covariance[(i, j)]).abs() / scale;
                 assert!(error < 0.12, "window {window}, covariance {i},{j}: {sample} against {}", covariance[(i, j)]);

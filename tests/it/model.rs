@@ -16,9 +16,8 @@ fn check_against_reference(file: &str, model: Cvsim6, script: Vec<Change>) {
     for row in &reference.rows {
         patient.advance_to(row[0]).unwrap();
         let derived = patient.derived();
-        let worst = |mine: &[f64], theirs: &[f64]| {
-            mine.iter().zip(theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
-        };
+        let worst =
+            |mine: &[f64], theirs: &[f64]| mine.iter().zip(theirs).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         pressure = pressure.max(worst(patient.state(), &row[1..7]));
         flow = flow.max(worst(&derived[..6], &row[7..13]));
         volume = volume.max(worst(&derived[6..], &row[13..19]));
@@ -52,9 +51,7 @@ fn initial_pressures_are_the_published_ones() {
 
 /// Central differences with Richardson extrapolation.
 fn derivative(f: impl Fn(f64) -> Vec<f64>, at: f64, step: f64) -> Vec<f64> {
-    let central = |h: f64| -> Vec<f64> {
-        f(at + h).iter().zip(f(at - h)).map(|(a, b)| (a - b) / (2.0 * h)).collect()
-    };
+    let central = |h: f64| -> Vec<f64> { f(at + h).iter().zip(f(at - h)).map(|(a, b)| (a - b) / (2.0 * h)).collect() };
     central(step / 2.0).iter().zip(central(step)).map(|(fine, coarse)| (4.0 * fine - coarse) / 3.0).collect()
 }
 

@@ -43,7 +43,8 @@ fn dependencies_point_one_way() {
 
 #[test]
 fn the_core_knows_no_clock_socket_thread_or_log() {
-    let banned = ["std::time::", "std::net", "std::thread", "std::fs", "tokio", "zenoh", "tracing", "rayon", "println!"];
+    let banned =
+        ["std::time::", "std::net", "std::thread", "std::fs", "tokio", "zenoh", "tracing", "rayon", "println!"];
     for file in rust_files(&root().join("src")) {
         if layer(&file).is_none_or(|l| l > 2) {
             continue;

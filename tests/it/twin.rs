@@ -82,10 +82,8 @@ pub fn watch(settings: &EstimatorSettings, seconds: f64, rate_hz: f64, noise_see
         }
     }
     estimator.handle(Input::End, ArrivalTime(ns_from_s(seconds)), &Serial, &mut outputs);
-    let estimates: Vec<Estimate> = outputs
-        .into_iter()
-        .filter_map(|o| if let Output::Estimate(e) = o { Some(e) } else { None })
-        .collect();
+    let estimates: Vec<Estimate> =
+        outputs.into_iter().filter_map(|o| if let Output::Estimate(e) = o { Some(e) } else { None }).collect();
     let truth = estimates
         .iter()
         .map(|e| {
@@ -121,8 +119,7 @@ fn coupled_finds_resistance_and_compliance_from_two_channels() {
     let seeds = 6;
     let mut mean_coverage = [0.0; 6];
     for seed in 0..seeds {
-        let mut settings =
-            settings(CouplingKind::Coupled, &[State::A, State::Pa], &[Parameter::RPv, Parameter::CA]);
+        let mut settings = settings(CouplingKind::Coupled, &[State::A, State::Pa], &[Parameter::RPv, Parameter::CA]);
         settings.seed = seed;
         let run = watch(&settings, 5.0, 200.0, 50 + seed);
         let last = run.estimates.last().unwrap();
@@ -167,8 +164,7 @@ fn independent_finds_the_resistance_and_keeps_the_spread_of_its_start() {
 #[test]
 fn every_parameter_can_be_estimated() {
     let model = Cvsim6::default();
-    let all: Vec<usize> =
-        (0..model.parameters().len()).filter(|&p| model.parameters()[p].estimable).collect();
+    let all: Vec<usize> = (0..model.parameters().len()).filter(|&p| model.parameters()[p].estimable).collect();
     assert_eq!(all.len(), 18, "sixteen physical ones, p_th and the beat phase");
     let mut settings = settings(CouplingKind::Coupled, &[State::A, State::V, State::Pa], &[]);
     settings.estimate = all.clone();

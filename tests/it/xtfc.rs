@@ -109,8 +109,7 @@ fn compare_solvers(seed: u64, phase: f64, initial_state: bool, length_s: f64, no
     let law = if nonlinear { PulmonaryResistance::Nonlinear } else { PulmonaryResistance::Linear };
     let model = Cvsim6 { pulmonary_resistance: law, ..Cvsim6::default() };
     let mut theta = model.default_parameters();
-    let mut patient =
-        Simulator::new(model, Cvsim6::initial_pressures(&theta).unwrap(), theta.clone(), vec![]);
+    let mut patient = Simulator::new(model, Cvsim6::initial_pressures(&theta).unwrap(), theta.clone(), vec![]);
     patient.advance_to(0.01 + phase).unwrap();
     theta.copy_from_slice(patient.parameters());
     let basis = basis(FeatureSpec::default(), length_s, seed);

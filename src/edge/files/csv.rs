@@ -116,7 +116,9 @@ impl RecordReader {
     pub fn next_row(&mut self) -> Result<Option<Row>, CsvError> {
         let more = self.reader.read_record(&mut self.record);
         let line = self.record.position().map(csv::Position::line);
-        if !more.map_err(|e| content(&self.path, e.position().map(csv::Position::line), e.to_string(), "a row like the header"))? {
+        if !more.map_err(|e| {
+            content(&self.path, e.position().map(csv::Position::line), e.to_string(), "a row like the header")
+        })? {
             if self.last.is_none() {
                 return Err(content(&self.path, None, "no row", "at least one sample"));
             }
@@ -146,7 +148,8 @@ impl RecordReader {
         let value = cell.parse::<f64>().ok().filter(|v| column != self.time_column || v.is_finite());
         value.ok_or_else(|| {
             let found = format!("`{cell}` in column `{}`", self.headers.get(column).map_or("", String::as_str));
-            let empty = if column == self.time_column { "a number" } else { "a number, or nothing for a missing sample" };
+            let empty =
+                if column == self.time_column { "a number" } else { "a number, or nothing for a missing sample" };
             content(&self.path, line, found, empty)
         })
     }

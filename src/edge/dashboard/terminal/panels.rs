@@ -199,7 +199,8 @@ pub(super) fn draw_values(buf: &mut Buffer, area: Rect, bed: &Bed, drawn: Group)
     let truth = bed.truth.since(i64::MAX).last().map(|(_, row)| row);
     for (column, group) in (0..).zip(others) {
         let half = Rect { x: area.x + column * width, width: width.max(1), ..area };
-        let title = vec![Span::styled(group.name(), style::STRONG), Span::styled(format!(" {}", group.unit()), style::QUIET)];
+        let title =
+            vec![Span::styled(group.name(), style::STRONG), Span::styled(format!(" {}", group.unit()), style::QUIET)];
         let inner = panel(buf, half, title);
         for (row, quantity) in (0..).zip(group.quantities()) {
             let name = quantity_names().nth(quantity).unwrap_or_default();
@@ -262,7 +263,11 @@ fn solver_health(status: &Status) -> Vec<Line<'static>> {
     let ms = |value: f64| style::number(value, if value < 9.995 { 2 } else { usize::from(value < 99.95) });
     vec![
         Facts::default()
-            .add("members", format!("{}/{}", status.members_alive, status.members), status.members_alive < status.members)
+            .add(
+                "members",
+                format!("{}/{}", status.members_alive, status.members),
+                status.members_alive < status.members,
+            )
             .add("windows", style::count(status.windows), false)
             .line(),
         Facts::default()
@@ -318,7 +323,8 @@ fn counters(counters: &[(String, u64)]) -> Vec<Line<'static>> {
 
 /// Writes the health lines.
 pub(super) fn draw_health(buf: &mut Buffer, area: Rect, lines: Vec<Line<'static>>) {
-    let inner = panel(buf, area, vec![Span::styled("health", style::STRONG), Span::styled(" lag, solve in ms", style::QUIET)]);
+    let inner =
+        panel(buf, area, vec![Span::styled("health", style::STRONG), Span::styled(" lag, solve in ms", style::QUIET)]);
     for (row, line) in (0..inner.height).zip(lines) {
         put(buf, inner, row, line);
     }

@@ -223,7 +223,8 @@ fn garbage_is_counted_and_makes_no_bed() {
     assert_eq!((ward.unreadable, ward.beds.len()), (30, 0));
     assert_shows(&screen(&ward, &Ui::new(None), SECOND, (80, 24)), &["30 messages, 30 of them unreadable", "WAITING"]);
 
-    let elsewhere = ["ward", "ward/bed1", "wardrobe/bed1/status", "ward/bed1/estimate/state/json", "ward/b/pressure/ICP"];
+    let elsewhere =
+        ["ward", "ward/bed1", "wardrobe/bed1/status", "ward/bed1/estimate/state/json", "ward/b/pressure/ICP"];
     for key in elsewhere {
         ward.apply(&Message { key: key.to_owned(), encoding: Encoding::Json, payload: vec![1] }, SECOND);
     }

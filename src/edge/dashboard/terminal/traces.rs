@@ -239,7 +239,12 @@ fn draw_labels(buf: &mut Buffer, area: Rect, scale: Scale) {
             }
         };
         let number = style::number(value, 0);
-        put_right(buf, margin, row, Line::from(vec![Span::styled(number, style::QUIET), Span::styled("┤", style::RULE)]));
+        put_right(
+            buf,
+            margin,
+            row,
+            Line::from(vec![Span::styled(number, style::QUIET), Span::styled("┤", style::RULE)]),
+        );
     }
 }
 
