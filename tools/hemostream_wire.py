@@ -43,21 +43,6 @@ STATE_STATISTICS = ("mean", "sd", "epistemic_sd", "aleatoric_sd", "model_sd", "q
 PARAMETER_STATISTICS = ("mean", "sd", "q05", "q95", "identifiability", "since_informed_s")
 """Last axis of `ParameterEstimate.values`."""
 
-QUANTITIES = (
-    "p_l", "p_a", "p_v", "p_r", "p_pa", "p_pv",
-    "q_li", "q_lo", "q_a", "q_ri", "q_ro", "q_pv",
-    "v_l", "v_a", "v_v", "v_r", "v_pa", "v_pv",
-)  # fmt: skip
-"""Order in which quantities are listed where a message does not say it (JSON objects have no order)."""
-
-PARAMETERS = (
-    "heart_rate", "systole", "p_th",
-    "c_l_dia", "c_l_sys", "c_a", "c_v", "c_r_dia", "c_r_sys", "c_pa", "c_pv",
-    "r_li", "r_lo", "r_a", "r_ri", "r_ro", "r_pv",
-    "v0_l", "v0_a", "v0_v", "v0_r", "v0_pa", "v0_pv", "blood_volume", "beat_phase",
-)  # fmt: skip
-"""The same for parameters."""
-
 
 class WireError(ValueError):
     """A payload that cannot be understood."""
@@ -180,8 +165,7 @@ def decode(kind: type[M], payload: bytes) -> M:
 def from_json(kind: type[M], payload: bytes | str) -> M:
     """Reads the JSON twin of a message; raises like `decode`.
 
-    Where the JSON is an object by name, the names are put in the order of `QUANTITIES` and `PARAMETERS`;
-    others follow alphabetically.
+    Where the JSON is an object by name, `names` tells the order.
     """
     _check_length(payload)
     try:
@@ -340,7 +324,7 @@ class StateEstimate:
     @classmethod
     def read_json(cls, body: Mapping[str, Any]) -> Self:
         times_ns, quantities = _integers(body, "times_ns"), _object(body, "quantities")
-        names = _unique(_strings(body, "names"))
+        names = _named(body, quantities)
         values = np.zeros((len(times_ns), len(names), len(STATE_STATISTICS)))
         for q, name in enumerate(names):
             for s, statistic in enumerate(STATE_STATISTICS):
@@ -387,7 +371,7 @@ class ParameterEstimate:
     @classmethod
     def read_json(cls, body: Mapping[str, Any]) -> Self:
         parameters = _object(body, "parameters")
-        names = _unique(_strings(body, "names"))
+        names = _named(body, parameters)
         rows = [[_required(_object(parameters, n), s) for s in PARAMETER_STATISTICS] for n in names]
         values = _floats([value for row in rows for value in row], "parameters")
         shape = (len(names), len(PARAMETER_STATISTICS))
@@ -591,7 +575,7 @@ class Truth:
     @classmethod
     def read_json(cls, body: Mapping[str, Any]) -> Self:
         values = _object(body, "values")
-        names = _unique(_strings(body, "names"))
+        names = _named(body, values)
         numbers = _floats([values[name] for name in names], "values")
         return cls(_integer(body, "schema"), _integer(body, "time_ns"), names, numbers)
 
@@ -635,8 +619,11 @@ def _shaped(values: Floats, shape: tuple[int, ...], what: str = "values") -> Flo
     return values.reshape(shape)
 
 
-def _ordered(by_name: Mapping[str, Any], order: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(n for n in order if n in by_name) + tuple(sorted(n for n in by_name if n not in order))
+def _named(body: Mapping[str, Any], by_name: Mapping[str, Any]) -> tuple[str, ...]:
+    names = _unique(_strings(body, "names"))
+    if set(names) != set(by_name):
+        raise Malformed("`names` are not those of the numbers")
+    return names
 
 
 def _same(left: Any, right: Any) -> bool:

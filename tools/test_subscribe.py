@@ -74,7 +74,8 @@ def state_json(sequence: int, time_ns: int) -> dict[str, Any]:
     quantities = {
         name: {s: [values[7 * q + i]] for i, s in enumerate(STATE_STATISTICS)} for q, name in enumerate(QUANTITY_NAMES)
     }
-    body = {"members": 100, "times_ns": [time_ns], "since_data_s": [0.0], "quantities": quantities}
+    body = {"members": 100, "times_ns": [time_ns], "since_data_s": [0.0]}
+    body |= {"names": list(QUANTITY_NAMES), "quantities": quantities}
     return header_json(sequence, time_ns) | body
 
 
@@ -85,7 +86,7 @@ def parameter_bytes(sequence: int, time_ns: int, names: tuple[str, ...] = PARAME
 
 def parameter_json(sequence: int, time_ns: int) -> dict[str, Any]:
     values = dict(zip(PARAMETER_STATISTICS, parameter_values(time_ns), strict=True))
-    return header_json(sequence, time_ns) | {"members": 100, "parameters": {"r_pv": values}}
+    return header_json(sequence, time_ns) | {"members": 100, "names": ["r_pv"], "parameters": {"r_pv": values}}
 
 
 def event_bytes(sequence: int, time_ns: int, words: str) -> bytes:

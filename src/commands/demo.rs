@@ -11,7 +11,7 @@ use clap::Args;
 use hemostream::edge::bus::{Bus, Message, Subscription};
 use hemostream::edge::config::{Config, ZenohMode, ZenohSettings};
 use hemostream::edge::dashboard::terminal;
-use hemostream::edge::replay::{Bed, ReplayOptions, Source, run};
+use hemostream::edge::replay::{Bed, ReplayOptions, Source, run, wait_for_listener};
 use hemostream::edge::scoreboard::Scoreboard;
 use hemostream::edge::zenoh::ZenohBus;
 use hemostream::model::Model;
@@ -88,7 +88,7 @@ impl Demo {
         let (_subscription, messages) = subscribe(bus, config)?;
         let options = ReplayOptions { seconds: self.seconds, ..ReplayOptions::default() };
         let mut beds = [Bed::new(BED, Source::synthetic(config, config.estimator.seed)?)];
-        wait_for_listener(bus, config);
+        wait_for_listener(bus, config, BED, stop);
         let ended = AtomicBool::new(false);
         let replayed = std::thread::scope(|scope| {
             let replay = scope.spawn(|| {
@@ -132,19 +132,6 @@ fn subscribe(bus: &ZenohBus, config: &Config) -> Result<(Subscription, Receiver<
         }
     });
     Ok((bus.subscribe(&pattern, handler)?, messages))
-}
-
-/// The daemon's subscription takes a moment to get here; what is published before is lost.
-fn wait_for_listener(bus: &ZenohBus, config: &Config) {
-    let key =
-        format!("{}/{BED}/pressure/{}", config.publish.prefix, config.observed.first().map_or("", String::as_str));
-    for _ in 0..100 {
-        if bus.is_wanted(&key) {
-            return;
-        }
-        std::thread::sleep(Duration::from_millis(50));
-    }
-    tracing::warn!("nobody listens to {key}");
 }
 
 fn score(messages: &Receiver<Message>, board: &Shared, ended: &AtomicBool) {

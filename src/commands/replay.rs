@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use hemostream::edge::config::{Config, ZenohMode, ZenohSettings};
-use hemostream::edge::replay::{Bed, ReplayOptions, Source, run};
+use hemostream::edge::replay::{Bed, ReplayOptions, Source, run, wait_for_listener};
 use hemostream::edge::zenoh::ZenohBus;
 
 use super::serve::{asked_to_stop, tokio_runtime};
@@ -90,6 +90,9 @@ impl Replay {
             config.publish.prefix,
             settings.connect.join(", ")
         ));
+        if !beds.first().is_some_and(|bed| wait_for_listener(&bus, &config, bed.name(), &stop)) {
+            say("nobody listens yet; publishing all the same");
+        }
         let seconds = run(&bus, &config, &options, &mut beds, &stop)?;
         bus.close();
         say(format!("published {seconds:.1} patient-seconds"));

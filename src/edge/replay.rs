@@ -17,6 +17,9 @@ use crate::runtime::clock::Clock;
 /// Longest sleep before looking whether to stop.
 const MAX_SLEEP: Duration = Duration::from_millis(50);
 
+/// How often to look for a listener.
+const LISTENER_LOOKS: u32 = 100;
+
 /// What cannot be replayed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
@@ -137,6 +140,12 @@ impl Bed {
         }
     }
 
+    /// Its name.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
     /// Makes the next row; false at the end.
     #[allow(clippy::cast_precision_loss)]
     fn make_row(&mut self, config: &Config, options: &ReplayOptions) -> Result<bool, ReplayError> {
@@ -242,6 +251,23 @@ fn truth(patient: &SyntheticPatient, time: EventTime) -> Truth {
     let names = quantities.chain(model.parameters().iter().map(|p| p.name.to_owned())).collect();
     let values = patient.truth().into_iter().chain(patient.parameters().iter().copied()).collect();
     Truth { schema: SCHEMA, time_ns: time.0, names, values }
+}
+
+/// Waits for somebody to listen to a bed: a subscription takes a moment to get here, and what is published before it
+/// has is lost. False if nobody did within a few seconds.
+pub fn wait_for_listener(bus: &dyn Bus, config: &Config, bed: &str, stop: &AtomicBool) -> bool {
+    let channel = config.observed.first().map_or("", String::as_str);
+    let key = format!("{}/{bed}/pressure/{channel}", config.publish.prefix);
+    for _ in 0..LISTENER_LOOKS {
+        if bus.is_wanted(&key) {
+            return true;
+        }
+        if stop.load(Ordering::Relaxed) {
+            break;
+        }
+        std::thread::sleep(MAX_SLEEP);
+    }
+    false
 }
 
 /// Publishes all beds side by side until they end or `stop` is set; returns the patient-seconds published.

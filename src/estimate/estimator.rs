@@ -279,7 +279,10 @@ impl<M: Model> Estimator<M> {
         self.report(channel, &ingested, now, out);
         if ingested.clock_changed {
             self.start_anew(out);
-            self.cutter.clear(now);
+            let dropped = self.cutter.clear(now) as u64;
+            if dropped > 0 {
+                *self.refused.entry(Refusal::ClockJump).or_default() += dropped;
+            }
             ingested = self.cutter.ingest(channel, samples, now);
             self.report(channel, &ingested, now, out);
         }

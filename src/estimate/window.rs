@@ -22,6 +22,9 @@ const MAX_PENDING: usize = 65_536;
 /// Blocks in a row from another time before it is believed that the sender's clock has changed.
 const CLOCK_JUMP_BLOCKS: u32 = 3;
 
+/// Event times beyond this, 146 years to either side of zero, are nobody's; sums of the others stay integers.
+const MAX_TIME_NS: u64 = 1 << 62;
+
 /// Moments at which the frontier moved that are remembered; enough for the allowed lateness at a few kHz.
 const MAX_FRONTIER_MARKS: usize = 4096;
 
@@ -90,7 +93,7 @@ pub struct Ingested {
     pub refused: [usize; Refusal::ALL.len()],
     /// The channel was silent and is back.
     pub recovered: bool,
-    /// The sender lives in another time: whoever owns this must start again.
+    /// The sender lives in another time: nothing was taken, and whoever owns this must start again with this block.
     pub clock_changed: bool,
 }
 
@@ -182,33 +185,41 @@ impl WindowCutter {
     /// Takes a block of one channel.
     pub fn ingest(&mut self, channel: usize, samples: &[RawSample], now: ArrivalTime) -> Ingested {
         let mut result = Ingested::default();
-        let Some(last) = samples.iter().map(|s| s.time).max() else {
+        let Some(newest) = samples.iter().map(|s| s.time).filter(|t| is_possible(*t)).max() else {
+            result.refused[Refusal::ClockJump as usize] = samples.len();
             return result;
         };
-        if self.is_from_another_time(last, now) {
-            let strikes = &mut self.channels[channel].strikes;
-            *strikes += 1;
-            result.clock_changed = *strikes >= CLOCK_JUMP_BLOCKS;
-            result.refused[Refusal::ClockJump as usize] = samples.len();
+        if self.is_from_another_time(newest, now) {
+            self.channels[channel].strikes += 1;
+            result.clock_changed = self.believes_in_another_time(channel);
+            if !result.clock_changed {
+                result.refused[Refusal::ClockJump as usize] = samples.len();
+            }
             return result;
         }
         self.channels[channel].strikes = 0;
         self.ended = false;
+        let present = self.marks.back().map_or(newest, |(frontier, _)| *frontier);
+        let oldest = present.plus_ns(-self.settings.forecast_limit_ns);
         for sample in samples {
-            match self.take(channel, *sample) {
+            match self.take(channel, *sample, oldest) {
                 Ok(()) => result.kept += 1,
                 Err(refusal) => result.refused[refusal as usize] += 1,
             }
         }
-        // Late samples count as well: a channel that always comes a little after the others would stay silent for
-        // ever if windows did not begin to wait for it again.
-        if result.kept > 0 || result.refused[Refusal::Late as usize] > 0 {
-            let liveness = &mut self.channels[channel].liveness;
-            result.recovered = *liveness == Liveness::Silent;
-            *liveness = Liveness::Live;
-        }
+        // Whatever its samples are worth, it is there. Nonsense tells the time; and a channel that always comes a
+        // little after the others would stay silent for ever if windows did not begin to wait for it again.
+        let liveness = &mut self.channels[channel].liveness;
+        result.recovered = *liveness == Liveness::Silent;
+        *liveness = Liveness::Live;
         self.advance_frontier(now);
         result
+    }
+
+    /// Whether the sender's clock has changed, rather than that of one of several devices.
+    fn believes_in_another_time(&self, channel: usize) -> bool {
+        let here = |(i, c): (usize, &Channel)| i != channel && c.liveness == Liveness::Live && c.strikes == 0;
+        self.channels[channel].strikes >= CLOCK_JUMP_BLOCKS && !self.channels.iter().enumerate().any(here)
     }
 
     /// Far from where this bed is, beyond what the time passed since would explain.
@@ -221,14 +232,18 @@ impl WindowCutter {
         ahead > limit.saturating_add(now.ns_since(at).max(0)) || ahead < -limit
     }
 
-    fn take(&mut self, channel: usize, sample: RawSample) -> Result<(), Refusal> {
+    fn take(&mut self, channel: usize, sample: RawSample, oldest: EventTime) -> Result<(), Refusal> {
         let closed_to = self.closed_to;
         let channel = &mut self.channels[channel];
-        if !sample.value.is_finite() {
-            return Err(Refusal::NotFinite);
+        let from_another_time = !is_possible(sample.time) || (closed_to.is_none() && sample.time < oldest);
+        if from_another_time {
+            return Err(Refusal::ClockJump);
         }
         // The clock of the channel goes on, whatever the value is worth.
         channel.delivered = channel.delivered.max(Some(sample.time));
+        if !sample.value.is_finite() {
+            return Err(Refusal::NotFinite);
+        }
         let (low, high) = channel.settings.plausible_mmhg;
         if sample.value < low || sample.value > high {
             return Err(Refusal::Implausible);
@@ -383,11 +398,17 @@ impl WindowCutter {
         self.advance_frontier(now);
     }
 
-    /// Forgets everything, for a sender whose clock has changed.
-    pub fn clear(&mut self, now: ArrivalTime) {
+    /// Forgets everything, for a sender whose clock has changed; returns how many samples were waiting.
+    pub fn clear(&mut self, now: ArrivalTime) -> usize {
+        let dropped = self.pending();
         for channel in &mut self.channels {
             channel.pending.clear();
         }
         self.restart(now);
+        dropped
     }
+}
+
+fn is_possible(time: EventTime) -> bool {
+    time.0.unsigned_abs() <= MAX_TIME_NS
 }

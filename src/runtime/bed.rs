@@ -186,7 +186,8 @@ impl Bed {
             // A sender that starts again counts from 0.
             let lost = if sequence > due { sequence - due } else { 0 };
             if lost > 0 {
-                *self.counters.entry("lost_blocks").or_default() += lost;
+                let counter = self.counters.entry("lost_blocks").or_default();
+                *counter = counter.saturating_add(lost);
             }
         }
         *expected = Some(sequence.wrapping_add(1));

@@ -257,6 +257,8 @@ impl Service {
             });
             // A defect in one bed must not take the others with it.
             let event = catch_unwind(work).map_or_else(|_| Event::Lost(name), Event::Done);
+            // Let go before the bed is back: when the service has stopped, nobody is left who still publishes.
+            drop((workers, sink));
             let _ = returns.send(event);
         });
     }

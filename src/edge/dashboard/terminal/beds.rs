@@ -13,6 +13,10 @@ use super::ui::Ui;
 use super::view::badge;
 use super::ward::{Bed, Ward, quantity_names};
 
+const NAME_WIDTH: usize = 12;
+/// Of the longest state with its number.
+const STATE_WIDTH: usize = 25;
+
 /// One row per bed, the chosen one in view.
 pub(super) fn draw(buf: &mut Buffer, area: Rect, ward: &Ward, ui: &Ui, now: Duration) {
     let title = format!("{} beds under {}", ward.beds.len(), ward.prefix());
@@ -32,7 +36,7 @@ pub(super) fn draw(buf: &mut Buffer, area: Rect, ward: &Ward, ui: &Ui, now: Dura
 
 fn heading() -> String {
     format!(
-        "{:<12} {:<22} {:>4}  {:<14} {:<14} {:>8} {:>8}  {}",
+        "{:<NAME_WIDTH$}  {:<STATE_WIDTH$}{:>4}  {:<14} {:<14} {:>8} {:>8}  {}",
         "bed", "state", "HR", "p_a mmHg", "p_pv mmHg", "members", "p99 ms", "last event"
     )
 }
@@ -52,10 +56,11 @@ fn summary(name: &str, bed: &Bed, now: Duration, is_chosen: bool) -> Vec<Span<'s
     let lag = status.map_or(style::NONE.to_owned(), |s| style::number(s.lag_p99_ms, 2));
     let event = bed.events.back().map(|e| format!("{} {}", e.kind, e.channel)).unwrap_or_default();
     let (state, look) = badge(bed.liveness(now));
-    let name: String = name.chars().take(12).collect();
+    let name: String = name.chars().take(NAME_WIDTH).collect();
     vec![
-        Span::styled(format!("{name:<12} "), if is_chosen { style::STRONG } else { style::PLAIN }),
-        Span::styled(format!("{:<22}", state.trim()), look),
+        Span::styled(format!("{name:<NAME_WIDTH$} "), if is_chosen { style::STRONG } else { style::PLAIN }),
+        Span::styled(state.clone(), look),
+        Span::raw(" ".repeat(STATE_WIDTH.saturating_sub(state.chars().count()))),
         Span::styled(format!(" {heart_rate:>4}  "), style::STRONG),
         Span::styled(format!("{:<14} {:<14} ", pressure("p_a"), pressure("p_pv")), style::PLAIN),
         Span::styled(format!("{members:>8} {lag:>8}  "), style::QUIET),

@@ -1,6 +1,6 @@
 //! The terminal dashboard: a bedside monitor for every bed on the bus.
 //!
-//! [`run`] owns the terminal and the clock; `ward` is what is known, `ui` what is chosen, `view` a pure function
+//! [`run`] owns the terminal and asks the clock; `ward` is what is known, `ui` what is chosen, `view` a pure function
 //! of both. Deliberately absent: anything that is published. A watcher subscribes to what it shows and no more,
 //! so that neither JSON twins nor whole ensembles are sent on its account.
 
@@ -21,7 +21,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event};
@@ -29,6 +29,7 @@ use ratatui::crossterm::event::{self, Event};
 use self::ui::{Next, Ui};
 use self::ward::Ward;
 use crate::edge::bus::{Bus, BusError, Handler, Message, Subscription};
+use crate::runtime::clock::Clock;
 
 /// What is shown, under `PREFIX/BED/`.
 const TOPICS: [&str; 6] = ["pressure/*", "estimate/state", "estimate/parameters", "truth", "status", "event"];
@@ -59,7 +60,7 @@ pub fn run(bus: &dyn Bus, prefix: &str, bed: Option<&str>, stop: &AtomicBool) ->
         // Restores the terminal whichever way this ends.
         let _restore = Restore;
         let mut terminal = ratatui::try_init()?;
-        Screen { ward: Ward::new(prefix), ui: Ui::new(bed), feed, start: Instant::now() }.run(&mut terminal, stop)
+        Screen { ward: Ward::new(prefix), ui: Ui::new(bed), feed, clock: Clock::start() }.run(&mut terminal, stop)
     })
 }
 
@@ -100,15 +101,20 @@ struct Screen {
     ward: Ward,
     ui: Ui,
     feed: Feed,
-    start: Instant,
+    clock: Clock,
 }
 
 impl Screen {
+    /// Time since the screen was opened.
+    fn now(&self) -> Duration {
+        Duration::from_nanos(self.clock.now().0.unsigned_abs())
+    }
+
     fn run(&mut self, terminal: &mut DefaultTerminal, stop: &AtomicBool) -> io::Result<()> {
         while !stop.load(Ordering::Relaxed) {
-            let frame_start = Instant::now();
+            let frame_start = self.now();
             self.take_messages(frame_start);
-            let now = self.start.elapsed();
+            let now = self.now();
             terminal.draw(|frame| view::draw(frame, &self.ward, &self.ui, now))?;
             if self.obey_keys(frame_start)? == Next::Quit {
                 break;
@@ -117,7 +123,7 @@ impl Screen {
         Ok(())
     }
 
-    fn take_messages(&mut self, frame_start: Instant) {
+    fn take_messages(&mut self, frame_start: Duration) {
         self.ui.is_connecting = self.feed.last_values.is_some();
         self.ui.dropped = self.feed.dropped.load(Ordering::Relaxed);
         if let Some(last_values) = &self.feed.last_values {
@@ -131,26 +137,57 @@ impl Screen {
             }
             self.feed.last_values = None;
         }
-        while frame_start.elapsed() < SHARE {
+        loop {
+            let now = self.now();
+            if now.saturating_sub(frame_start) >= SHARE {
+                break;
+            }
             let Ok(message) = self.feed.receiver.try_recv() else { break };
-            self.ward.apply(&message, self.start.elapsed());
+            self.ward.apply(&message, now);
         }
     }
 
     /// Obeys keys until the next picture is due.
-    fn obey_keys(&mut self, frame_start: Instant) -> io::Result<Next> {
+    fn obey_keys(&mut self, frame_start: Duration) -> io::Result<Next> {
         loop {
-            let left = FRAME.saturating_sub(frame_start.elapsed());
+            let left = (frame_start + FRAME).saturating_sub(self.now());
             if !event::poll(left)? {
                 return Ok(Next::Continue);
             }
             if let Event::Key(key) = event::read()? {
-                if self.ui.press(key, &self.ward, self.start.elapsed()) == Next::Quit {
+                let now = self.now();
+                if self.ui.press(key, &self.ward, now) == Next::Quit {
                     return Ok(Next::Quit);
                 }
             } else {
                 return Ok(Next::Continue);
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod feed_tests {
+    use super::*;
+    use crate::edge::bus::{Delivery, Encoding, MemoryBus};
+
+    #[test]
+    fn nobody_makes_twins_or_ensembles_for_a_watcher_and_a_full_queue_is_counted() {
+        let (bus, dropped) = (MemoryBus::new(), Arc::new(AtomicU64::new(0)));
+        let (sender, receiver) = sync_channel(2);
+        let subscriptions = subscribe(&bus, "some/ward", &sender, &dropped).unwrap();
+        for wanted in ["estimate/state", "estimate/parameters", "truth", "status", "event", "pressure/p_a"] {
+            assert!(bus.is_wanted(&format!("some/ward/bed1/{wanted}")), "{wanted}");
+        }
+        for unwanted in ["estimate/state/json", "estimate/members", "status/json"] {
+            assert!(!bus.is_wanted(&format!("some/ward/bed1/{unwanted}")), "{unwanted}");
+        }
+        let message = Message { key: "some/ward/bed1/status".to_owned(), encoding: Encoding::Bincode, payload: vec![] };
+        for _ in 0..5 {
+            bus.publish(message.clone(), Delivery::Estimates).unwrap();
+        }
+        assert_eq!((receiver.try_iter().count(), dropped.load(Ordering::Relaxed)), (2, 3));
+        drop(subscriptions);
+        assert!(!bus.is_wanted("some/ward/bed1/status"));
     }
 }

@@ -7,14 +7,18 @@ use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
 
 use super::paper::{DOTS_X, DOTS_Y, Ink, Raster, panel, put, put_right};
-use super::style;
+use super::style::{self, count};
 use super::traces::reading;
 use super::ui::{Group, Ui};
-use super::ward::{Bed, Parameter, Ward, quantity_names, seconds};
+use super::ward::{Band, Bed, Parameter, Ward, quantity_names, seconds};
 use crate::edge::wire::{ChannelStatus, Status};
 
 /// Below this the gauge of a band says nothing.
 const LEAST_GAUGE: u16 = 8;
+/// Below this a trend says nothing.
+const LEAST_TREND: u16 = 12;
+/// From this width of a panel on its title says more.
+const WIDTH_WITH_TREND_TITLE: u16 = 44;
 /// From this on there is room for a gauge and a trend side by side.
 const GAUGE_AND_TREND: u16 = 26;
 /// Innovations beyond this factor of what is expected are marked.
@@ -23,6 +27,9 @@ const MISFIT: f64 = 1.5;
 const UNINFORMED_AFTER_S: f64 = 5.0;
 /// Status is sent once a second; older than this, it is marked.
 const STATUS_OVERDUE: Duration = Duration::from_secs(3);
+
+/// How far back the axis of a gauge looks \[ns\].
+const GAUGE_LOOK_BACK_NS: i64 = 30_000_000_000;
 
 /// A parameter as text.
 struct ParameterText {
@@ -33,45 +40,74 @@ struct ParameterText {
 }
 
 impl ParameterText {
-    fn new(parameter: &Parameter, truth: Option<f64>) -> Self {
+    fn new(parameter: &Parameter, truth: Option<f64>, is_short: bool) -> Self {
         let Parameter { mean, low, high, .. } = *parameter;
         let digits = style::decimals(mean, 0.5 * (high - low));
-        let number = |value| style::number(value, digits);
+        let number = |value| if is_short { style::short_number(value, digits) } else { style::number(value, digits) };
+        let comma = if is_short { "," } else { ", " };
         Self {
             name: parameter.name.clone(),
             mean: number(mean),
-            band: format!("[{}, {}]", number(low), number(high)),
+            band: format!("[{}{comma}{}]", number(low), number(high)),
             truth: truth.map(|v| format!("◆{}", number(v))).unwrap_or_default(),
         }
     }
 }
 
-/// Widest of some texts.
-fn widest<'a>(texts: impl Iterator<Item = &'a String>) -> usize {
-    texts.map(|text| text.chars().count()).max().unwrap_or(0)
+/// Widths of the columns of [`ParameterText`].
+#[derive(Clone, Copy)]
+struct Columns {
+    name: usize,
+    mean: usize,
+    band: usize,
+    truth: usize,
 }
 
-/// Rows that the parameters need, one or two each, with the title.
+impl Columns {
+    fn of(texts: &[ParameterText]) -> Self {
+        let widest = |field: fn(&ParameterText) -> &String| {
+            texts.iter().map(|text| field(text).chars().count()).max().unwrap_or(0)
+        };
+        Self {
+            name: widest(|t| &t.name),
+            mean: widest(|t| &t.mean),
+            band: widest(|t| &t.band),
+            truth: widest(|t| &t.truth),
+        }
+    }
+
+    fn without_truth(self) -> usize {
+        self.name + self.mean + self.band + 3
+    }
+
+    fn with_truth(self) -> usize {
+        self.without_truth() + self.truth
+    }
+}
+
+/// Rows that the parameters need with the title, at so many each.
 pub(super) fn parameter_rows(bed: &Bed, rows_each: u16) -> u16 {
     1 + rows_each * u16::try_from(bed.parameters.len().max(1)).unwrap_or(u16::MAX)
 }
 
 /// Name, mean, band, truth, and where there is room a gauge of the band and the trend.
 pub(super) fn draw_parameters(buf: &mut Buffer, area: Rect, bed: &Bed, rows_each: u16) {
-    let title = vec![Span::styled("parameters", style::STRONG), Span::styled(" mean [5 %, 95 %]", style::QUIET)];
+    let mut title = vec![Span::styled("parameters", style::STRONG), Span::styled(" mean [5 %, 95 %]", style::QUIET)];
+    if rows_each > 1 && area.width >= WIDTH_WITH_TREND_TITLE {
+        title.push(Span::styled("  trend 2 min", style::QUIET));
+    }
     let inner = panel(buf, area, title);
     if bed.parameters.is_empty() {
         put(buf, inner, 0, Span::styled("none published", style::QUIET));
         return;
     }
     let truth = |p: &Parameter| bed.true_parameters.get(p.name.as_str()).copied();
-    let texts: Vec<_> = bed.parameters.iter().map(|p| ParameterText::new(p, truth(p))).collect();
-    let columns = [
-        widest(texts.iter().map(|t| &t.name)),
-        widest(texts.iter().map(|t| &t.mean)),
-        widest(texts.iter().map(|t| &t.band)),
-        widest(texts.iter().map(|t| &t.truth)),
-    ];
+    let as_text = |is_short| bed.parameters.iter().map(|p| ParameterText::new(p, truth(p), is_short)).collect();
+    let mut texts: Vec<ParameterText> = as_text(false);
+    if rows_each == 1 && Columns::of(&texts).with_truth() > usize::from(area.width) {
+        texts = as_text(true);
+    }
+    let columns = Columns::of(&texts);
     let fit = usize::from(inner.height / rows_each);
     let shown = if fit < texts.len() { fit.saturating_sub(1) } else { texts.len() };
     for (row, (parameter, text)) in (0..).zip(bed.parameters.iter().zip(&texts).take(shown)) {
@@ -89,20 +125,20 @@ fn draw_parameter(
     area: Rect,
     (parameter, text): (&Parameter, &ParameterText),
     truth: Option<f64>,
-    [name, mean, band, true_value]: [usize; 4],
+    columns: Columns,
 ) {
+    let Columns { name, mean, band, truth: true_value } = columns;
     let mut spans = vec![
         Span::styled(format!("{:<name$} ", text.name), style::INFERRED),
         Span::styled(format!("{:>mean$} ", text.mean), style::STRONG),
         Span::styled(format!("{:>band$} ", text.band), style::PLAIN),
     ];
-    let without_truth = name + mean + band + 3;
-    let is_truth_inline = without_truth + true_value <= usize::from(area.width);
+    let is_truth_inline = columns.with_truth() <= usize::from(area.width);
     if is_truth_inline {
         spans.push(Span::styled(format!("{:<true_value$} ", text.truth), style::TRUTH));
     }
     put(buf, area, 0, Line::from(spans));
-    let used = if is_truth_inline { without_truth + true_value + usize::from(true_value > 0) } else { without_truth };
+    let used = if is_truth_inline { columns.with_truth() + 1 } else { columns.without_truth() };
     let used = u16::try_from(used).unwrap_or(u16::MAX).min(area.width);
     let rest = Rect { x: area.x + used, width: area.width - used, ..area };
     if area.height == 1 {
@@ -110,24 +146,30 @@ fn draw_parameter(
         return;
     }
     let mut below = Rect { y: area.y + 1, height: 1, ..area };
-    if rest.width >= LEAST_GAUGE + 4 {
+    if rest.width >= LEAST_TREND {
         draw_trend(buf, rest, parameter);
-        below.width = used.saturating_sub(1);
-    }
-    let (unit, look) = if parameter.since_informed_s > UNINFORMED_AFTER_S {
-        (format!("no news {}", style::duration(parameter.since_informed_s)), style::WARNING)
+        below.width = used - 1;
     } else {
-        (parameter.unit.to_owned(), style::QUIET)
-    };
-    let unit_width = unit.chars().count() as u16 + 1;
-    put(buf, below, 0, Span::styled(unit, look));
+        draw_trend(buf, Rect { y: area.y + 2, height: area.height - 2, ..area }, parameter);
+    }
     if !is_truth_inline {
         put_right(buf, below, 0, Span::styled(text.truth.clone(), style::TRUTH));
-        below.width = below.width.saturating_sub(true_value as u16 + 1);
+        below.width = below.width.saturating_sub(u16::try_from(true_value).unwrap_or(u16::MAX).saturating_add(1));
     }
-    let shift = unit_width.min(below.width);
-    let gauge = Rect { x: below.x + shift, width: below.width - shift, ..below };
-    draw_gauge(buf, gauge, parameter, truth);
+    draw_unit_and_gauge(buf, below, parameter, truth);
+}
+
+fn draw_unit_and_gauge(buf: &mut Buffer, area: Rect, parameter: &Parameter, truth: Option<f64>) {
+    let is_uninformed = parameter.since_informed_s > UNINFORMED_AFTER_S;
+    let text = if is_uninformed {
+        Span::styled(format!("uninformed {} ", style::duration(parameter.since_informed_s)), style::WARNING)
+    } else {
+        // As wide as the widest unit, so that the gauges stand in line.
+        Span::styled(format!("{:<9} ", parameter.unit), style::QUIET)
+    };
+    let shift = u16::try_from(text.width()).unwrap_or(u16::MAX).min(area.width);
+    put(buf, area, 0, text);
+    draw_gauge(buf, Rect { x: area.x + shift, width: area.width - shift, ..area }, parameter, truth);
 }
 
 fn draw_beside(buf: &mut Buffer, area: Rect, parameter: &Parameter, truth: Option<f64>) {
@@ -140,17 +182,26 @@ fn draw_beside(buf: &mut Buffer, area: Rect, parameter: &Parameter, truth: Optio
     }
 }
 
-/// Lowest and highest value of a parameter lately, its present ones and its truth included.
-fn range(parameter: &Parameter, truth: Option<f64>) -> Option<(f64, f64)> {
-    let trend = parameter.trend.since(i64::MIN).flat_map(|(_, b)| [f64::from(b.low), f64::from(b.high)]);
-    let all = trend.chain([parameter.low, parameter.high]).chain(truth).filter(|v| v.is_finite());
-    let (low, high) = all.fold((f64::MAX, f64::MIN), |(low, high), v| (low.min(v), high.max(v)));
+/// The range of a parameter since a time, its present values and its truth included.
+///
+/// The extreme tenths of the past may leave the picture, or else a wide first guess would rule it for minutes.
+fn range(parameter: &Parameter, from_ns: i64, truth: Option<f64>) -> Option<(f64, f64)> {
+    let past = |bound: fn(&Band) -> f32| {
+        let mut values: Vec<f64> = parameter.trend.since(from_ns).map(|(_, b)| f64::from(bound(b))).collect();
+        values.sort_by(f64::total_cmp);
+        values
+    };
+    let (lows, highs) = (past(|b| b.low), past(|b| b.high));
+    let extremes = [lows.get(lows.len() / 10), highs.iter().rev().nth(highs.len() / 10)];
+    let all = extremes.into_iter().flatten().copied().chain([parameter.low, parameter.high]).chain(truth);
+    let (low, high) = all.filter(|v| v.is_finite()).fold((f64::MAX, f64::MIN), |(l, h), v| (l.min(v), h.max(v)));
     (low < high).then_some((low, high))
 }
 
-/// The band on an axis as wide as the bands of the trend: `··━━●━━◆··`.
+/// The band on an axis as wide as the bands were lately: `··━━●━━◆··`.
 fn draw_gauge(buf: &mut Buffer, area: Rect, parameter: &Parameter, truth: Option<f64>) {
-    let Some((low, high)) = range(parameter, truth) else { return };
+    let from_ns = parameter.trend.newest_ns().unwrap_or(i64::MIN).saturating_sub(GAUGE_LOOK_BACK_NS);
+    let Some((low, high)) = range(parameter, from_ns, truth) else { return };
     if area.width < LEAST_GAUGE || area.height == 0 {
         return;
     }
@@ -170,7 +221,9 @@ fn draw_gauge(buf: &mut Buffer, area: Rect, parameter: &Parameter, truth: Option
 
 /// Mean and band of the last two minutes.
 fn draw_trend(buf: &mut Buffer, area: Rect, parameter: &Parameter) {
-    let (Some((low, high)), Some(newest_ns)) = (range(parameter, None), parameter.trend.newest_ns()) else { return };
+    let (Some((low, high)), Some(newest_ns)) = (range(parameter, i64::MIN, None), parameter.trend.newest_ns()) else {
+        return;
+    };
     let oldest_ns = parameter.trend.since(i64::MIN).next().map_or(newest_ns, |(t, _)| t);
     let (dots_x, dots_y) = (i64::from(area.width * DOTS_X), f64::from(area.height * DOTS_Y));
     let span_s = seconds(newest_ns.saturating_sub(oldest_ns)).max(1.0);
@@ -196,7 +249,7 @@ pub(super) fn draw_values(buf: &mut Buffer, area: Rect, bed: &Bed, drawn: Group)
     const WIDTH_WITH_TRUTH: u16 = 27;
     let others: Vec<Group> = Group::ALL.into_iter().filter(|g| *g != drawn).collect();
     let width = area.width / 2;
-    let truth = bed.truth.since(i64::MAX).last().map(|(_, row)| row);
+    let mean_width = if width < 19 { 5 } else { 7 };
     for (column, group) in (0..).zip(others) {
         let half = Rect { x: area.x + column * width, width: width.max(1), ..area };
         let title =
@@ -208,10 +261,11 @@ pub(super) fn draw_values(buf: &mut Buffer, area: Rect, bed: &Bed, drawn: Group)
             let (mean, half) = band.map_or((style::NONE.to_owned(), String::new()), reading);
             let mut spans = vec![
                 Span::styled(format!("{name:<5}"), style::INFERRED),
-                Span::styled(format!("{mean:>5}"), style::STRONG),
+                Span::styled(format!("{mean:>mean_width$}"), style::STRONG),
                 Span::styled(format!("{half:<6}"), style::QUIET),
             ];
-            if let Some(truth) = truth.map(|row| f64::from(row[quantity])).filter(|_| width >= WIDTH_WITH_TRUTH) {
+            let truth = bed.truth_now(quantity);
+            if truth.is_finite() && width >= WIDTH_WITH_TRUTH {
                 spans.push(Span::styled(format!(" ◆{}", style::number(truth, 1)), style::TRUTH));
             }
             put(buf, inner, row, Line::from(spans));
@@ -254,7 +308,7 @@ pub(super) fn health(bed: &Bed, ward: &Ward, ui: &Ui, now: Duration) -> Vec<Line
     }
     let screen = [("dropped", ui.dropped), ("unreadable", ward.unreadable), ("beds refused", ward.refused)];
     for (what, n) in screen.into_iter().filter(|(_, n)| *n > 0) {
-        lines.push(Facts::default().add("this screen:", format!("{} {what}", style::count(n)), true).line());
+        lines.push(Facts::default().add("this screen:", format!("{} {what}", count(n)), true).line());
     }
     lines
 }
@@ -268,7 +322,12 @@ fn solver_health(status: &Status) -> Vec<Line<'static>> {
                 format!("{}/{}", status.members_alive, status.members),
                 status.members_alive < status.members,
             )
-            .add("windows", style::count(status.windows), false)
+            .add("queue", count(status.queue_depth.into()), false)
+            .add("iter", style::number(status.iterations, 1), false)
+            .line(),
+        Facts::default()
+            .add("windows", count(status.windows), false)
+            .add("without data", count(status.windows_without_data), false)
             .line(),
         Facts::default()
             .add("lag p50", ms(status.lag_p50_ms), false)
@@ -277,12 +336,7 @@ fn solver_health(status: &Status) -> Vec<Line<'static>> {
             .line(),
         Facts::default()
             .add("solve", ms(status.solve_ms), false)
-            .add("queue", status.queue_depth.to_string(), false)
-            .add("no data", style::count(status.windows_without_data), false)
-            .line(),
-        Facts::default()
-            .add("not converged", style::count(status.not_converged), status.not_converged > 0)
-            .add("iter", style::number(status.iterations, 1), false)
+            .add("not converged", count(status.not_converged), status.not_converged > 0)
             .line(),
     ]
 }
@@ -291,16 +345,17 @@ fn channel_health(channel: &ChannelStatus, status: &Status) -> Line<'static> {
     let is_live = channel.state == "live";
     let silence_s = seconds(status.header.time_ns.saturating_sub(channel.last_sample_ns));
     let state = match channel.state.as_str() {
+        "silent" if silence_s < 10.0 => format!("silent {silence_s:.0} s"),
         "silent" => format!("silent {}", style::duration(silence_s)),
         other => other.to_owned(),
     };
     let rms = channel.innovation_rms;
     let mut spans = vec![
         Span::styled(format!("{:<5}", channel.name), style::OBSERVED),
-        Span::styled(format!("{state:<7}"), if is_live { style::PLAIN } else { style::WARNING }),
+        Span::styled(format!("{state:<11} "), if is_live { style::PLAIN } else { style::WARNING }),
     ];
-    let fit = Facts::default().add("fit rms", style::number(rms, 2), rms > MISFIT);
-    spans.extend(fit.add("n", style::count(channel.samples_used), false).0);
+    let fit = Facts::default().add("rms", style::number(rms, 2), rms > MISFIT);
+    spans.extend(fit.add("n", count(channel.samples_used), false).0);
     Line::from(spans)
 }
 
@@ -309,7 +364,7 @@ fn counters(counters: &[(String, u64)]) -> Vec<Line<'static>> {
     const LINE: usize = 30;
     let mut lines: Vec<String> = Vec::new();
     for (cause, n) in counters {
-        let text = format!("{cause} {}", style::count(*n));
+        let text = format!("{cause} {}", count(*n));
         match lines.last_mut() {
             Some(line) if line.chars().count() + text.chars().count() + 2 <= LINE => {
                 line.push_str("  ");

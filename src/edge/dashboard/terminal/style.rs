@@ -19,6 +19,8 @@ pub(super) const BOLD: Style = Style::new().add_modifier(Modifier::BOLD);
 pub(super) const STRONG: Style = Style::new().fg(WHITE).add_modifier(Modifier::BOLD);
 pub(super) const PLAIN: Style = Style::new().fg(WHITE);
 pub(super) const QUIET: Style = Style::new().fg(GREY);
+/// What was, and may be no longer.
+pub(super) const PAST: Style = Style::new().fg(GREY).remove_modifier(Modifier::BOLD);
 pub(super) const RULE: Style = Style::new().fg(DARK_GREY);
 pub(super) const OBSERVED: Style = Style::new().fg(BLUISH_GREEN);
 pub(super) const INFERRED: Style = Style::new().fg(SKY_BLUE);
@@ -46,17 +48,33 @@ pub(super) fn number(value: f64, decimals: usize) -> String {
     match value {
         v if !v.is_finite() => NONE.to_owned(),
         v if v.abs() >= 1e6 => format!("{v:.1e}"),
-        v => format!("{v:.decimals$}"),
+        v => {
+            let text = format!("{v:.decimals$}");
+            // A minus before nothing but zeros says nothing.
+            let is_zero = text.bytes().all(|b| matches!(b, b'-' | b'0' | b'.'));
+            if is_zero { text.trim_start_matches('-').to_owned() } else { text }
+        }
     }
 }
 
-/// A count in at most five characters.
+/// The same without the zero before the point.
+pub(super) fn short_number(value: f64, decimals: usize) -> String {
+    let text = number(value, decimals);
+    match text.strip_prefix('-').unwrap_or(&text).strip_prefix("0.") {
+        Some(digits) if text.starts_with('-') => format!("-.{digits}"),
+        Some(digits) => format!(".{digits}"),
+        None => text,
+    }
+}
+
+/// A count in about four characters: where it is cut off at the edge, it would be a wrong one.
 pub(super) fn count(n: u64) -> String {
     match n as f64 {
-        _ if n < 100_000 => n.to_string(),
+        _ if n < 10_000 => n.to_string(),
         v if v < 1e6 => format!("{:.0}k", v / 1e3),
-        v if v < 1e9 => format!("{:.1}M", v / 1e6),
-        v if v < 1e12 => format!("{:.1}G", v / 1e9),
+        v if v < 1e7 => format!("{:.1}M", v / 1e6),
+        v if v < 1e9 => format!("{:.0}M", v / 1e6),
+        v if v < 1e12 => format!("{:.0}G", v / 1e9),
         v => format!("{v:.0e}"),
     }
 }
@@ -96,6 +114,8 @@ mod tests {
         assert_eq!(shown(3001.4, 12.0), "3001");
         assert_eq!(shown(f64::NAN, 1.0), NONE);
         assert_eq!(shown(1e300, 1.0), "1.0e300");
+        assert_eq!([number(-0.04, 1), number(-0.06, 1)], ["0.0", "-0.1"]);
+        assert_eq!([short_number(0.25, 2), short_number(-0.25, 2), short_number(10.25, 2)], [".25", "-.25", "10.25"]);
     }
 
     #[test]

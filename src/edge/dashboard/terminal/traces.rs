@@ -45,6 +45,8 @@ struct Scale {
     low: f64,
     high: f64,
     dots: u16,
+    /// Digits after the point that tell the ends.
+    decimals: usize,
 }
 
 impl Scale {
@@ -52,7 +54,8 @@ impl Scale {
     fn around(seen: (f64, f64), least: f64, dots: u16) -> Self {
         let (centre, half) = (0.5 * (seen.0 + seen.1), 0.5 * (seen.1 - seen.0).max(least));
         let step = round_step(half / 5.0);
-        Self { low: ((centre - half) / step).floor() * step, high: ((centre + half) / step).ceil() * step, dots }
+        let (low, high) = (((centre - half) / step).floor() * step, ((centre + half) / step).ceil() * step);
+        Self { low, high, dots, decimals: usize::from(step < 1.0) }
     }
 
     fn y(self, value: f64) -> Option<i64> {
@@ -120,6 +123,7 @@ pub(super) fn draw(buf: &mut Buffer, area: Rect, bed: &Bed, group: Group, span_s
         draw_time_axis(buf, axis, span_s);
     }
     let height = (inner.height / traces).max(1);
+    let liveness = bed.liveness(now);
     for (row, quantity) in (0..).zip(quantities) {
         let strip = Rect { y: inner.y + row * height, height, ..inner }.intersection(inner);
         if strip.is_empty() {
@@ -127,16 +131,18 @@ pub(super) fn draw(buf: &mut Buffer, area: Rect, bed: &Bed, group: Group, span_s
         }
         let plot = Rect { x: strip.x + LABEL_WIDTH, width: plot_width, ..strip };
         let numbers = Rect { x: plot.right() + 1, width: readout, ..strip };
-        let is_live = matches!(bed.liveness(now), Liveness::Live { .. });
-        draw_trace(buf, plot, bed, quantity, window, is_live);
-        draw_readout(buf, numbers, bed, quantity, is_live);
+        draw_trace(buf, plot, bed, quantity, window, liveness);
+        draw_readout(buf, numbers, bed, quantity);
+        if !liveness.is_live() {
+            buf.set_style(numbers, style::PAST);
+        }
     }
 }
 
 fn readout_width(width: u16) -> u16 {
     match width {
         0..58 => 15,
-        58..100 => 18,
+        58..100 => 19,
         _ => 22,
     }
 }
@@ -149,7 +155,7 @@ fn title(bed: &Bed, group: Group, width: u16) -> Vec<Span<'static>> {
         Span::styled("━", style::INFERRED),
         Span::styled(if width < 58 { " mean " } else { " mean  " }, style::QUIET),
         Span::styled("⢕⢕", style::BAND),
-        Span::styled(if width < 58 { " 5–95% " } else { " 5–95 %  " }, style::QUIET),
+        Span::styled(if width < 58 { " 5–95% " } else { " 5–95 % (± half)  " }, style::QUIET),
     ];
     if group == Group::Pressures && width >= 58 {
         title.extend([Span::styled("⠢⠔", style::SAMPLE), Span::styled(" samples  ", style::QUIET)]);
@@ -194,7 +200,7 @@ fn seen(bed: &Bed, quantity: usize, window: Window) -> Option<(f64, f64)> {
     Some((low.min(truth.0.max(mean.0 - room)), high.max(truth.1.min(mean.1 + room))))
 }
 
-fn draw_trace(buf: &mut Buffer, area: Rect, bed: &Bed, quantity: usize, window: Window, is_live: bool) {
+fn draw_trace(buf: &mut Buffer, area: Rect, bed: &Bed, quantity: usize, window: Window, liveness: Liveness) {
     let Some(seen) = seen(bed, quantity, window) else { return };
     let scale = Scale::around(seen, Group::of(quantity).least_range(), area.height * DOTS_Y);
     draw_labels(buf, area, scale);
@@ -209,19 +215,18 @@ fn draw_trace(buf: &mut Buffer, area: Rect, bed: &Bed, quantity: usize, window: 
     }
     draw_mean(&mut raster, bed, quantity, window, scale);
     draw_truth(&mut raster, bed, quantity, window, scale);
-    let line = line_style(bed.origin(quantity), is_live);
-    raster.paint(buf, area, |ink| match ink {
-        _ if !is_live && ink != Ink::Band => line,
-        Ink::Band => style::BAND,
-        Ink::Sample => style::SAMPLE,
-        Ink::Mean => line,
-        Ink::Truth => style::TRUTH,
+    let line = line_style(bed.origin(quantity));
+    raster.paint(buf, area, |ink| match (ink, liveness) {
+        (Ink::Band, _) => style::BAND,
+        (Ink::Sample, Liveness::Live { .. } | Liveness::NoEstimate) => style::SAMPLE,
+        (Ink::Mean, Liveness::Live { .. }) => line,
+        (Ink::Truth, Liveness::Live { .. }) => style::TRUTH,
+        _ => style::PAST,
     });
 }
 
-fn line_style(origin: Origin, is_live: bool) -> Style {
+fn line_style(origin: Origin) -> Style {
     match origin {
-        _ if !is_live => style::QUIET,
         Origin::Observed => style::OBSERVED,
         Origin::Silent | Origin::Inferred => style::INFERRED,
     }
@@ -238,7 +243,7 @@ fn draw_labels(buf: &mut Buffer, area: Rect, scale: Scale) {
                 continue;
             }
         };
-        let number = style::number(value, 0);
+        let number = style::number(value, scale.decimals);
         put_right(
             buf,
             margin,
@@ -298,9 +303,9 @@ fn draw_truth(raster: &mut Raster, bed: &Bed, quantity: usize, window: Window, s
 }
 
 /// Name, origin, value, and what else there is room for.
-fn draw_readout(buf: &mut Buffer, area: Rect, bed: &Bed, quantity: usize, is_live: bool) {
+fn draw_readout(buf: &mut Buffer, area: Rect, bed: &Bed, quantity: usize) {
     let origin = bed.origin(quantity);
-    let line = line_style(origin, is_live);
+    let line = line_style(origin);
     let name = quantity_names().nth(quantity).unwrap_or_default();
     let tag = match origin {
         Origin::Observed => Span::styled("observed", line),
@@ -310,12 +315,14 @@ fn draw_readout(buf: &mut Buffer, area: Rect, bed: &Bed, quantity: usize, is_liv
     put(buf, area, 0, vec_line([Span::styled(format!("{name:<5}"), line.patch(style::BOLD)), tag]));
     let band = bed.state.as_ref().map(|(_, row)| row.bands[quantity]);
     let value = band.map_or((style::NONE.to_owned(), String::new()), reading);
-    let value_style = if is_live { style::STRONG } else { style::QUIET };
-    put(buf, area, 1, vec_line([Span::styled(value.0, value_style), Span::styled(value.1, value_style)]));
+    put(buf, area, 1, vec_line([Span::styled(value.0, style::STRONG), Span::styled(value.1, style::STRONG)]));
 
-    let truth = bed.truth.since(i64::MAX).last().map(|(_, row)| f64::from(row[quantity])).filter(|v| v.is_finite());
+    let truth = Some(bed.truth_now(quantity)).filter(|v| v.is_finite());
     let truth = truth.map(|v| Span::styled(format!("◆{}", style::number(v, 1)), style::TRUTH));
-    let extremes = bed.extremes(quantity).map(|(high, low)| Span::styled(format!("{high:.0}/{low:.0} "), style::PLAIN));
+    let extremes = bed.extremes(quantity).map(|(high, low)| {
+        let [high, low] = [high, low].map(|v| style::number(f64::from(v), 0));
+        Span::styled(format!("{high}/{low} "), style::PLAIN)
+    });
     if area.height > 3 {
         put(buf, area, 2, extremes.unwrap_or_default());
         put(buf, area, 3, truth.unwrap_or_default());
@@ -332,12 +339,13 @@ fn vec_line<const N: usize>(spans: [Span<'static>; N]) -> Line<'static> {
 /// Mean, and half the width of the band; no digits that the band makes meaningless.
 pub(super) fn reading(band: Band) -> (String, String) {
     let half = 0.5 * f64::from(band.high - band.low);
+    let mean = f64::from(band.mean);
     let (mean_digits, half_digits) = match half {
-        h if h < 0.095 => (1, 2),
+        h if h < 0.095 => (if mean.abs() < 99.95 { 2 } else { 1 }, 2),
         h if h < 9.95 => (1, 1),
         _ => (0, 0),
     };
-    (style::number(f64::from(band.mean), mean_digits), format!(" ±{}", style::number(half, half_digits)))
+    (style::number(mean, mean_digits), format!(" ±{}", style::number(half, half_digits)))
 }
 
 fn description(name: &str) -> &'static str {

@@ -55,7 +55,7 @@ impl Group {
     /// Shortest vertical axis: less than this is no movement worth filling the height with.
     pub(super) fn least_range(self) -> f64 {
         match self {
-            Self::Pressures => 4.0,
+            Self::Pressures => 2.0,
             Self::Flows => 20.0,
             Self::Volumes => 8.0,
         }

@@ -20,6 +20,10 @@ const WIDTH_WITH_PANELS: u16 = 76;
 /// From this height on the events stand below the traces, not below everything.
 const TALL: u16 = 34;
 const TRACES: u16 = 6;
+/// Estimates of data older than this are marked.
+const LATE: Duration = Duration::from_millis(500);
+/// More of the name of a bed would push the rest off the header.
+const LONGEST_NAME: usize = 20;
 
 /// Draws everything; nothing but the arguments decides what it looks like.
 pub(super) fn draw(frame: &mut Frame<'_>, ward: &Ward, ui: &Ui, now: Duration) {
@@ -64,7 +68,7 @@ fn draw_header(buf: &mut Buffer, area: Rect, ward: &Ward, ui: &Ui, now: Duration
     let is_wide = area.width >= WIDTH_WITH_PANELS + 24;
     let mut spans = vec![
         Span::styled(if is_wide { " hemostream " } else { " " }, style::QUIET),
-        Span::styled(name.to_owned(), style::STRONG),
+        Span::styled(name.chars().take(LONGEST_NAME).collect::<String>(), style::STRONG),
         Span::styled(format!("{place}  "), style::QUIET),
     ];
     let Some((_, bed, at)) = ui.shown(ward, now) else {
@@ -88,13 +92,18 @@ fn draw_header(buf: &mut Buffer, area: Rect, ward: &Ward, ui: &Ui, now: Duration
         Span::styled("/min", style::QUIET),
     ]);
     put(buf, area, 0, Line::from(spans));
-    let age = bed.age(at).map_or(style::NONE.to_owned(), |age| style::duration(age.as_secs_f64()));
+    let age = bed.age(at);
+    let is_late = age.is_some_and(|age| age > LATE);
+    let age = age.map_or(style::NONE.to_owned(), |age| style::duration(age.as_secs_f64()));
     let time = bed.newest_ns(at).map_or(style::NONE.to_owned(), style::event_time);
     let right = vec![
         Span::styled(if is_wide { "  event time " } else { "  t " }, style::QUIET),
         Span::styled(time, style::STRONG),
         Span::styled("  age ", style::QUIET),
-        Span::styled(format!("{age} "), style::STRONG),
+        Span::styled(
+            format!("{age}{}", if is_late { "!" } else { " " }),
+            if is_late { style::WARNING } else { style::STRONG },
+        ),
     ];
     put_right(buf, area, 0, Line::from(right));
 }
@@ -138,7 +147,7 @@ fn draw_waiting(buf: &mut Buffer, area: Rect, ward: &Ward, ui: &Ui) {
 fn draw_bed(buf: &mut Buffer, area: Rect, (bed, at): (&Bed, Duration), ward: &Ward, ui: &Ui) {
     let panel_width = match area.width {
         0..WIDTH_WITH_PANELS => 0,
-        w if w < 100 => 32,
+        w if w < 100 => 33,
         w => (w * 7 / 20).min(80),
     };
     let is_tall = area.height + 2 >= TALL;
@@ -169,23 +178,25 @@ fn events_height(height: u16) -> u16 {
     if each < LOWEST_TRACE {
         return 0;
     }
-    let axis = u16::from(height >= 1 + LEAST + 1 + 3 * TRACES + 1);
+    let axis = u16::from(height > 1 + LEAST + 1 + 3 * TRACES);
     let each = if axis == 1 { (without_titles - 1) / TRACES } else { each };
     // A few more events are worth more than the tenth row of a trace.
-    let each = each.min(3 + height / 12);
+    let each = each.min(3 + height / 10);
     height - 1 - axis - each * TRACES
 }
 
 fn draw_panels(buf: &mut Buffer, area: Rect, (bed, at): (&Bed, Duration), ward: &Ward, ui: &Ui) {
     const LEAST_HEALTH: u16 = 5;
+    const MORE_ROWS_PER_PARAMETER: [u16; 5] = [6, 5, 4, 3, 2];
     let health = panels::health(bed, ward, ui, at);
     let health_rows = 1 + u16::try_from(health.len()).unwrap_or(u16::MAX);
     let one_each = panels::parameter_rows(bed, 1).min(area.height.saturating_sub(LEAST_HEALTH));
     let rest = area.height - one_each;
     let values = if rest >= panels::VALUE_ROWS + LEAST_HEALTH { panels::VALUE_ROWS } else { 0 };
     let spare = rest.saturating_sub(values + health_rows);
-    let two_each = panels::parameter_rows(bed, 2);
-    let (parameters, rows_each) = if one_each + spare >= two_each { (two_each, 2) } else { (one_each, 1) };
+    let fits = |rows: &u16| panels::parameter_rows(bed, *rows) <= one_each + spare;
+    let rows_each = MORE_ROWS_PER_PARAMETER.into_iter().find(fits).unwrap_or(1);
+    let parameters = if rows_each > 1 { panels::parameter_rows(bed, rows_each) } else { one_each };
 
     let mut top = area.y;
     let mut next = |height: u16| {
@@ -196,6 +207,9 @@ fn draw_panels(buf: &mut Buffer, area: Rect, (bed, at): (&Bed, Duration), ward: 
     panels::draw_parameters(buf, next(parameters), bed, rows_each);
     if values > 0 {
         panels::draw_values(buf, next(values), bed, ui.group);
+    }
+    if !bed.liveness(at).is_live() {
+        buf.set_style(Rect { height: parameters + values, ..area }.intersection(area), style::PAST);
     }
     panels::draw_health(buf, next(area.height.saturating_sub(parameters + values)), health);
 }

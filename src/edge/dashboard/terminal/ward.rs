@@ -9,7 +9,7 @@ use std::time::Duration;
 use super::history::{History, Limits};
 use crate::edge::bus::{Encoding, Message};
 use crate::edge::wire::{
-    self, ChannelStatus, Event, PARAMETER_STATISTICS, ParameterEstimate, PressureBlock, STATE_STATISTICS,
+    self, ChannelStatus, Event, Header, PARAMETER_STATISTICS, ParameterEstimate, PressureBlock, STATE_STATISTICS,
     StateEstimate, Status, Truth,
 };
 use crate::model::cvsim6::{FlowsAndVolumes, PARAMETERS, Pressures};
@@ -73,10 +73,10 @@ pub(super) struct Parameter {
 }
 
 /// A line of the event log.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct EventLine {
     pub(super) time_ns: i64,
-    pub(super) sequence: u64,
+    sequence: u64,
     pub(super) kind: String,
     pub(super) channel: String,
     pub(super) text: String,
@@ -107,6 +107,12 @@ pub(super) enum Liveness {
     Stale(Duration),
     /// Only values from before this screen was opened.
     NotHeard,
+}
+
+impl Liveness {
+    pub(super) fn is_live(self) -> bool {
+        matches!(self, Self::Live { .. })
+    }
 }
 
 /// One bed.
@@ -354,13 +360,14 @@ impl Bed {
     }
 
     fn take_event(&mut self, event: &Event) {
-        let (time_ns, sequence) = (event.header.time_ns, event.header.sequence);
+        let [kind, channel] = [&event.kind, &event.channel].map(|s| tame(s, MAX_NAME));
+        let Header { time_ns, sequence, .. } = event.header;
+        let line = EventLine { time_ns, sequence, kind, channel, text: tame(&event.text, MAX_TEXT) };
         // A last value may arrive a second time as news.
-        if self.events.iter().any(|e| e.time_ns == time_ns && e.sequence == sequence) {
+        if self.events.contains(&line) {
             return;
         }
-        let [kind, channel] = [&event.kind, &event.channel].map(|s| tame(s, MAX_NAME));
-        self.events.push_back(EventLine { time_ns, sequence, kind, channel, text: tame(&event.text, MAX_TEXT) });
+        self.events.push_back(line);
         if self.events.len() > MAX_EVENTS {
             self.events.pop_front();
         }
@@ -381,19 +388,42 @@ impl Bed {
         }
     }
 
-    /// Time since an estimate (or, without any, a sample) arrived.
+    /// Age of the data behind the newest estimate: how long ago it arrived, and how far it is behind the samples.
     pub(super) fn age(&self, now: Duration) -> Option<Duration> {
-        self.estimate_arrival.or(self.sample_arrival).map(|arrival| now.saturating_sub(arrival))
+        let since_arrival = now.saturating_sub(self.estimate_arrival.or(self.sample_arrival)?);
+        let (Some((estimate_ns, _)), Some(sample_ns)) = (&self.state, self.newest_sample_ns()) else {
+            return Some(since_arrival);
+        };
+        let behind_ns = u64::try_from(sample_ns.saturating_sub(*estimate_ns)).unwrap_or(0);
+        Some(since_arrival + Duration::from_nanos(behind_ns))
+    }
+
+    fn newest_sample_ns(&self) -> Option<i64> {
+        self.samples.iter().filter_map(History::newest_ns).max()
+    }
+
+    /// The true value at the time of the newest estimate, which may be behind; NaN if not known there.
+    pub(super) fn truth_now(&self, quantity: usize) -> f64 {
+        const CLOSE_NS: u64 = 20_000_000;
+        const BRIDGED_NS: i64 = 200_000_000;
+        let Some(time_ns) = self.state.as_ref().map(|(t, _)| *t) else { return f64::NAN };
+        let mut rows = self.truth.since(time_ns).map(|(t, row)| (t, f64::from(row[quantity])));
+        match (rows.next(), rows.next()) {
+            (Some((t0, before)), Some((t1, after))) if t0 <= time_ns && t1.saturating_sub(t0) <= BRIDGED_NS => {
+                before + (after - before) * seconds(time_ns - t0) / seconds(t1 - t0)
+            }
+            (Some((t, value)), _) if t.abs_diff(time_ns) <= CLOSE_NS => value,
+            _ => f64::NAN,
+        }
     }
 
     /// The event time at the right edge of the picture.
     pub(super) fn newest_ns(&self, now: Duration) -> Option<i64> {
-        let sample = || self.samples.iter().filter_map(History::newest_ns).max();
         let estimate = self.state.as_ref().map(|(t, _)| *t);
         match self.liveness(now) {
             // The silence of the estimator must be seen as a gap.
-            Liveness::NoEstimate => sample().max(estimate),
-            _ => estimate.or_else(sample),
+            Liveness::NoEstimate => self.newest_sample_ns().max(estimate),
+            _ => estimate.or_else(|| self.newest_sample_ns()),
         }
     }
 
