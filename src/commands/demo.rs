@@ -30,6 +30,7 @@ const SETTINGS: &[&str] = &[
     "estimator.initial_guess.c_a=2.4",
     "patient.variability={ r_pv = 0.01, c_a = 0.01 }",
     "estimator.parameter_drift=0.01",
+    "estimator.pressure_drift=0.005",
 ];
 
 const BED: &str = "demo";

@@ -175,7 +175,7 @@ impl Bed {
                     None if !options.repeat => return Ok(false),
                     None => {
                         let (first, last) = span.unwrap_or((0, 0));
-                        *reader = Box::new(RecordReader::open(path, config)?);
+                        **reader = RecordReader::open(path, config)?;
                         let Some(row) = reader.next_row()? else { return Ok(false) };
                         // The next pass begins one typical spacing after the last row.
                         *shift_ns += last - first + ns_from_s(1.0 / options.rate_hz);

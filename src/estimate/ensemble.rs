@@ -462,6 +462,18 @@ impl Member {
             dense::solve(&problem, &mut self.solution);
         }
         self.solved = self.solution.is_finite();
+        if !self.solved {
+            self.stay();
+        }
+    }
+
+    /// Takes the state and parameters at the start for the whole window, so that nothing without a number is read
+    /// from it where no other member can stand in.
+    fn stay(&mut self) {
+        self.solution.beta.fill(0.0);
+        self.solution.start.clone_from(&self.x);
+        self.solution.end.clone_from(&self.x);
+        self.solution.theta.clone_from(&self.theta);
     }
 }
 

@@ -7,8 +7,8 @@
 //! - when the allowed lateness is over: counted in arrival time from the moment at which the first channel delivered
 //!   past the end or, when none does, at which it was due.
 //!
-//! Then it is final: later samples for it are counted and dropped. What arrives, in which order and in which blocks
-//! changes nothing else. Every refusal has a [`Refusal`] and a counter.
+//! Then it is final: later samples for it are counted and dropped. In which order the channels arrive and how they are
+//! cut into blocks changes nothing else; one channel's own blocks are expected in order. Every refusal has a [`Refusal`] and a counter.
 
 use std::collections::VecDeque;
 
@@ -190,7 +190,8 @@ impl WindowCutter {
             return result;
         };
         if self.is_from_another_time(newest, now) {
-            self.channels[channel].strikes += 1;
+            let strikes = &mut self.channels[channel].strikes;
+            *strikes = strikes.saturating_add(1);
             result.clock_changed = self.believes_in_another_time(channel);
             if !result.clock_changed {
                 result.refused[Refusal::ClockJump as usize] = samples.len();

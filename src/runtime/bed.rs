@@ -184,7 +184,7 @@ impl Bed {
         let Some(expected) = self.expected.get_mut(channel) else { return };
         if let Some(due) = *expected {
             // A sender that starts again counts from 0.
-            let lost = if sequence > due { sequence - due } else { 0 };
+            let lost = sequence.saturating_sub(due);
             if lost > 0 {
                 let counter = self.counters.entry("lost_blocks").or_default();
                 *counter = counter.saturating_add(lost);

@@ -1,5 +1,7 @@
 //! All integration tests, one binary: linking zenoh once is enough.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::float_cmp, missing_docs, unreachable_pub)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::float_cmp, clippy::cast_possible_wrap)]
+#![allow(clippy::print_stdout, clippy::print_stderr)]
+#![allow(missing_docs, unreachable_pub)]
 
 mod cli;
 mod config;

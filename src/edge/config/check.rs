@@ -268,7 +268,7 @@ impl Checker {
             let message = format!("found {length_s:?}, expected {expected}");
             self.refuse_against("window.length_s", "window.allowed_lateness_s", message);
         }
-        self.number("window.forecast_limit_s", window.forecast_limit_s, &(0.0..=86_400.0), " s");
+        self.number("window.forecast_limit_s", window.forecast_limit_s, &positive_to(86_400.0), " s");
         self.whole("window.collocation_points", window.collocation_points, 2..=64);
         self.whole("window.neurons", window.neurons, 1..=256);
         self.distribution("window.weights", window.weights);
