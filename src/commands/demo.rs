@@ -16,6 +16,9 @@ use hemostream::edge::scoreboard::Scoreboard;
 use hemostream::edge::zenoh::ZenohBus;
 use hemostream::model::Model;
 use hemostream::model::cvsim6::Pressures;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 
 use super::serve::{Running, asked_to_stop, tokio_runtime};
 use super::simulate::positive;
@@ -30,10 +33,14 @@ const SETTINGS: &[&str] = &[
     "estimator.initial_guess.c_a=2.4",
     "patient.variability={ r_pv = 0.01, c_a = 0.01 }",
     "estimator.parameter_drift=0.01",
-    "estimator.pressure_drift=0.005",
+    "estimator.pressure_drift=0.002",
+    "estimator.seed=4",
 ];
 
 const BED: &str = "demo";
+
+/// Which random numbers of the seed decide where the patient starts.
+const START_STREAM: u64 = 3;
 
 /// Messages that may wait for the scoreboard.
 const QUEUE: usize = 4096;
@@ -88,7 +95,7 @@ impl Demo {
         let board = Shared::default();
         let (_subscription, messages) = subscribe(bus, config)?;
         let options = ReplayOptions { seconds: self.seconds, ..ReplayOptions::default() };
-        let mut beds = [Bed::new(BED, Source::synthetic(config, config.estimator.seed)?)];
+        let mut beds = [Bed::new(BED, Source::synthetic(&patient(config)?, config.estimator.seed)?)];
         wait_for_listener(bus, config, BED, stop);
         let ended = AtomicBool::new(false);
         let replayed = std::thread::scope(|scope| {
@@ -114,6 +121,25 @@ impl Demo {
         summary(config, &board.lock().unwrap_or_else(PoisonError::into_inner), replayed, options.rate_hz);
         Ok(())
     }
+}
+
+/// The patient starts somewhere in what the estimator is told of the start, and so with a blood volume that it does
+/// not know.
+fn patient(config: &Config) -> Result<Config, Failure> {
+    let mut rng = ChaCha8Rng::seed_from_u64(config.estimator.seed);
+    rng.set_stream(START_STREAM);
+    let mut drawn = config.patient.initial_pressures()?.into_iter().zip(config.patient.initial_sd()).map(|(p, sd)| {
+        let e: f64 = StandardNormal.sample(&mut rng);
+        Some(p + sd * e)
+    });
+    let mut patient = config.clone();
+    let initial = &mut patient.patient.initial;
+    for pressure in
+        [&mut initial.p_l, &mut initial.p_a, &mut initial.p_v, &mut initial.p_r, &mut initial.p_pa, &mut initial.p_pv]
+    {
+        *pressure = drawn.next().flatten();
+    }
+    Ok(patient)
 }
 
 /// A loopback endpoint on a port that is free now.
