@@ -21,7 +21,7 @@
 //!
 //! # Layers
 //!
-//! `model <- xtfc <- estimate <- runtime <- edge`: each knows those before it and nothing of those after it. The
+//! `model <- xtfc <- estimate <- runtime <- edge <- reproduce`: each knows those before it and nothing of those after it. The
 //! first three are pure: no clock, no socket, no thread, no log; a test checks it. Each module says what it
 //! guarantees and what is deliberately absent.
 //!
@@ -29,16 +29,19 @@
 //!
 //! | | |
 //! |---|---|
-//! | a physiological model | one file in [`model`]; its module documentation has the recipe |
+//! | a model | one file in [`model`]; [`model::adding_a_model`] is the recipe |
+//! | something that a model may lack | a `delta_...` parameter of it, see [`model::discrepancy`] |
 //! | an activation, a distribution, a node placement | [`xtfc::features`], and its name in [`edge::config`] |
 //! | another way to couple members | [`estimate::coupling`] |
 //! | a sensor name of a monitor | the table `[labels]` of the configuration |
 //! | a published quantity | [`model::Model::derived`] if it follows from states and parameters |
 //! | a topic | a type in [`edge::wire`], encoded in [`edge::outlet`] |
 //! | a command | a file in `src/commands` |
+//! | a study of the paper | a file in [`reproduce`], and its line in [`reproduce::STUDIES`] |
 
 pub mod edge;
 pub mod estimate;
 pub mod model;
+pub mod reproduce;
 pub mod runtime;
 pub mod xtfc;

@@ -10,7 +10,8 @@ use hemostream::estimate::estimator::{Estimator, Input, Output};
 use hemostream::estimate::time::ArrivalTime;
 use hemostream::estimate::window::RawSample;
 use hemostream::model::Model;
-use hemostream::model::cvsim6::{Cvsim6, Pressures};
+use hemostream::model::cvsim6::Pressures;
+use hemostream::model::discrepancy::Circulation;
 use hemostream::runtime::clock::Clock;
 use hemostream::runtime::workers::Workers;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -71,7 +72,7 @@ fn check_record(path: &Path, config: &Config) -> Result<f64, Failure> {
 
 /// An estimator between a record and a table.
 struct Run {
-    estimator: Estimator<Cvsim6>,
+    estimator: Estimator<Circulation>,
     /// Channel of each column, where it is listened to.
     channels: Vec<Option<usize>>,
     table: TableWriter,
@@ -88,8 +89,8 @@ struct Run {
 
 impl Run {
     fn new(config: &Config, output: &Path, reader: &RecordReader, seconds: f64) -> Result<Self, Failure> {
-        let model = config.patient.model();
-        let estimator = Estimator::new(model, config.estimator_settings()?).map_err(failed)?;
+        let model = config.circulation()?;
+        let estimator = Estimator::new(model.clone(), config.estimator_settings()?).map_err(failed)?;
         let channel = |state: &usize| estimator.settings().channels.iter().position(|c| c.state == *state);
         let channels: Vec<Option<usize>> = reader.states().iter().map(channel).collect();
         for (state, _) in reader.states().iter().zip(&channels).filter(|(_, c)| c.is_none()) {
@@ -104,7 +105,7 @@ impl Run {
         let style = ProgressStyle::with_template("{bar:40} {pos}/{len} s  {eta} left");
         progress.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
         Ok(Self {
-            table: TableWriter::create(output, &estimate_header(model, estimator.estimated()))?,
+            table: TableWriter::create(output, &estimate_header(&model, estimator.estimated()))?,
             estimator,
             channels,
             outputs: Vec::new(),

@@ -4,6 +4,7 @@ mod config;
 mod demo;
 mod estimate;
 mod replay;
+mod reproduce;
 mod serve;
 mod simulate;
 mod watch;
@@ -37,6 +38,7 @@ enum Command {
     Watch(watch::Watch),
     Simulate(simulate::Simulate),
     Estimate(estimate::Estimate),
+    Reproduce(reproduce::Reproduce),
     Config(config::ConfigCommand),
 }
 
@@ -119,6 +121,7 @@ pub(crate) fn main() -> ExitCode {
         Command::Watch(command) => command.run(),
         Command::Simulate(command) => command.run(),
         Command::Estimate(command) => command.run(),
+        Command::Reproduce(command) => command.run(),
         Command::Config(command) => command.run(),
     };
     let (message, code) = match result {

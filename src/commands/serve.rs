@@ -42,7 +42,7 @@ impl Running {
         };
         let settings = config.estimator_settings()?;
         let (service, inlet) =
-            Service::new(config.patient.model(), settings, limits, workers, sink, Clock::start()).map_err(failed)?;
+            Service::new(config.circulation()?, settings, limits, workers, sink, Clock::start()).map_err(failed)?;
         let task = tokio::spawn(service.run());
         let listening = inlet::listen(bus.as_ref(), config, inlet.clone())?;
         Ok(Self { inlet, task, _listening: listening })

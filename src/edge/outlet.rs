@@ -21,7 +21,7 @@ use crate::estimate::statistics::Summary;
 use crate::estimate::time::{EventTime, s_from_ns};
 use crate::estimate::window::Liveness;
 use crate::model::Model;
-use crate::model::cvsim6::Cvsim6;
+use crate::model::discrepancy::Circulation;
 use crate::runtime::bed::{Bed, Health};
 use crate::runtime::service::Sink;
 
@@ -40,7 +40,7 @@ pub struct Outlet {
     seed: u64,
     config_hash: u64,
     json: bool,
-    model: Cvsim6,
+    model: Circulation,
     queue: Option<SyncSender<(Message, Delivery)>>,
     dropped: AtomicU64,
     last: LastStore,
@@ -72,7 +72,7 @@ impl Outlet {
             seed: config.estimator.seed,
             config_hash: config.hash(),
             json: config.publish.json,
-            model: config.patient.model(),
+            model: config.circulation().map_err(|e| BusError::Transport(e.to_string()))?,
             queue: Some(queue),
             dropped: AtomicU64::new(0),
             last,
@@ -138,11 +138,11 @@ impl Outlet {
     fn estimate(&self, bed: &Bed, estimate: &Estimate) {
         let key = self.key(&bed.name, "estimate/state");
         let header = self.header(&key, estimate.time);
-        self.send(key, &state_message(header, self.model, estimate), Delivery::Estimates);
+        self.send(key, &state_message(header, &self.model, estimate), Delivery::Estimates);
 
         let key = self.key(&bed.name, "estimate/parameters");
         let header = self.header(&key, estimate.time);
-        self.send(key, &parameter_message(header, self.model, estimate), Delivery::Estimates);
+        self.send(key, &parameter_message(header, &self.model, estimate), Delivery::Estimates);
 
         if let Some(values) = &estimate.ensemble {
             let key = self.key(&bed.name, "estimate/members");
@@ -166,7 +166,7 @@ impl Outlet {
     fn status(&self, bed: &Bed, health: &Health) {
         let key = self.key(&bed.name, "status");
         let header = self.header(&key, health.time);
-        let mut status = status_message(header, self.model, health);
+        let mut status = status_message(header, &self.model, health);
         let dropped = self.dropped.load(Ordering::Relaxed);
         if dropped > 0 {
             status.counters.push(("publish_dropped".to_owned(), dropped));
@@ -278,7 +278,7 @@ fn count(n: usize) -> u32 {
 }
 
 /// One published time as a message.
-fn state_message(header: Header, model: Cvsim6, estimate: &Estimate) -> StateEstimate {
+fn state_message(header: Header, model: &Circulation, estimate: &Estimate) -> StateEstimate {
     let row = |s: &Summary| [s.mean, s.sd, s.epistemic_sd, s.aleatoric_sd, s.model_sd, s.q05, s.q95];
     StateEstimate {
         header,
@@ -290,7 +290,7 @@ fn state_message(header: Header, model: Cvsim6, estimate: &Estimate) -> StateEst
     }
 }
 
-fn parameter_message(header: Header, model: Cvsim6, estimate: &Estimate) -> ParameterEstimate {
+fn parameter_message(header: Header, model: &Circulation, estimate: &Estimate) -> ParameterEstimate {
     let row = |(p, since): &(crate::estimate::ensemble::ParameterSummary, i64)| {
         let s = &p.summary;
         [s.mean, s.sd, s.q05, s.q95, p.identifiability, s_from_ns(*since)]
@@ -304,7 +304,7 @@ fn parameter_message(header: Header, model: Cvsim6, estimate: &Estimate) -> Para
     }
 }
 
-fn status_message(header: Header, model: Cvsim6, health: &Health) -> Status {
+fn status_message(header: Header, model: &Circulation, health: &Health) -> Status {
     let channel = |c: &crate::estimate::estimator::ChannelHealth| ChannelStatus {
         name: model.states().get(c.state).map_or_else(String::new, |q| q.name.to_owned()),
         state: match c.liveness {

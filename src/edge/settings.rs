@@ -1,14 +1,85 @@
 //! From the configuration to what the core wants to know.
 
-use super::config::{self, Config, ConfigError};
+use super::config::{self, Config, ConfigError, DiscrepancyForm, DiscrepancySettings};
 use crate::estimate::settings::{ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings};
 use crate::estimate::time::ns_from_s;
 use crate::model::Model;
 use crate::model::cvsim6::{Cvsim6, Pressures};
+use crate::model::discrepancy::{Circulation, Discrepancy, Discrepant, Form};
 use crate::xtfc::features::{Activation, FeatureSpec, Nodes, WeightDistribution};
 use crate::xtfc::problem::Stopping;
 
+/// Where nothing is said of a discrepancy: of flows \[mL/s\] and of balances \[mmHg/s\].
+const MAGNITUDE: (f64, f64) = (300.0, 100.0);
+/// The same per square root of a second.
+const CHANGE: (f64, f64) = (100.0, 20.0);
+/// The paper's `L = 10 R` \[s\].
+const INERTANCE_S: f64 = 10.0;
+
+/// A discrepancy with everything filled in.
+#[derive(Debug, Clone, Copy)]
+struct Belief {
+    what: Discrepancy,
+    change: f64,
+    magnitude: f64,
+    initial_sd: f64,
+}
+
+impl Belief {
+    fn new(name: &str, settings: &DiscrepancySettings, parameter: usize) -> Self {
+        let of = |(flow, balance): (f64, f64)| if name.starts_with('q') { flow } else { balance };
+        let change = settings.change.unwrap_or(of(CHANGE));
+        let (form, initial_sd) = match settings.form {
+            DiscrepancyForm::Free => (Form::Free, 0.0),
+            DiscrepancyForm::Tracked => (Form::Tracked, 0.3 * change),
+            DiscrepancyForm::Inertial => (Form::Inertial { ratio_s: settings.inertance.unwrap_or(INERTANCE_S) }, 0.0),
+        };
+        Self {
+            what: Discrepancy { parameter, form },
+            change,
+            magnitude: settings.magnitude.unwrap_or(of(MAGNITUDE)),
+            initial_sd: settings.initial_sd.unwrap_or(initial_sd),
+        }
+    }
+
+    /// Weight of its equation at each of the nodes, so that all of them together count as the belief does.
+    #[allow(clippy::cast_precision_loss)]
+    fn weight(&self, config: &Config) -> f64 {
+        let (h, nodes) = (config.window.length_s, config.window.collocation_points as f64);
+        let independent = config.estimator.coupling == config::Coupling::Independent;
+        match self.what.form {
+            Form::Free => 1.0 / (self.magnitude * nodes.sqrt()),
+            // The sum over the nodes of (w delta'/h)^2 is (change of delta / (pace sqrt(h)))^2.
+            Form::Tracked if independent => (h / nodes).sqrt() / self.change,
+            // `coupled` moves it between windows; in a window it does what its equation says.
+            Form::Tracked | Form::Inertial { .. } => config.window.physics_weight,
+        }
+    }
+
+    /// Random walk between windows.
+    fn drift(&self) -> f64 {
+        if self.what.form == Form::Free { 0.0 } else { self.change }
+    }
+}
+
 impl Config {
+    /// The model that the estimator believes in: that of the patient, and what it may lack.
+    ///
+    /// # Errors
+    /// When a discrepancy cannot be had.
+    pub fn circulation(&self) -> Result<Circulation, ConfigError> {
+        let all: Vec<Discrepancy> = self.beliefs().iter().map(|belief| belief.what).collect();
+        Discrepant::new(self.patient.model(), &all).map_err(|error| ConfigError::discrepancy(&error))
+    }
+
+    fn beliefs(&self) -> Vec<Belief> {
+        let model = self.patient.model();
+        let belief = |(name, settings): (&String, &DiscrepancySettings)| {
+            model.parameter_index(&format!("delta_{name}")).map(|p| Belief::new(name, settings, p))
+        };
+        self.discrepancy.iter().filter_map(belief).collect()
+    }
+
     /// What an estimator is told: a checked configuration gives settings that an estimator accepts.
     ///
     /// # Errors
@@ -21,8 +92,12 @@ impl Config {
                 theta[p] = *guess;
             }
         }
-        let n = model.n_states();
         let (window, estimator) = (&self.window, &self.estimator);
+        let (n, beliefs) = (model.n_states(), self.beliefs());
+        // Discrepancies follow the pressures.
+        let with = |pressures: Vec<f64>, of: &dyn Fn(&Belief) -> f64| -> Vec<f64> {
+            pressures.into_iter().chain(beliefs.iter().map(of)).collect()
+        };
         Ok(EstimatorSettings {
             coupling: match estimator.coupling {
                 config::Coupling::Coupled => CouplingKind::Coupled,
@@ -33,8 +108,8 @@ impl Config {
             seed: estimator.seed,
             theta,
             initial_guess_sd: estimator.initial_guess_sd,
-            initial_state: self.patient.initial_pressures()?,
-            initial_state_sd: self.patient.initial_sd(),
+            initial_state: with(self.patient.initial_pressures()?, &|_| 0.0),
+            initial_state_sd: with(self.patient.initial_sd(), &|belief| belief.initial_sd),
             features: FeatureSpec {
                 activation: activation(window.activation),
                 count: window.neurons,
@@ -50,21 +125,18 @@ impl Config {
                 forecast_limit_ns: ns_from_s(window.forecast_limit_s),
             },
             weights: RowWeights {
-                physics: vec![window.physics_weight; n],
+                physics: with(vec![window.physics_weight; n], &|belief| belief.weight(self)),
                 data: window.data_weight,
                 parameter: window.parameter_weight,
             },
             drift: Drift {
                 parameters: estimator.parameter_drift,
-                pressures_mmhg: estimator.pressure_drift,
+                states: with(vec![estimator.pressure_drift; n], &Belief::drift),
                 inflation: estimator.inflation,
             },
             stopping: Stopping { max_iterations: estimator.max_iterations, tolerance_mmhg: estimator.tolerance },
             channels: self.observed_channels(model),
-            aleatoric_sd_mmhg: Pressures::NAMES
-                .iter()
-                .map(|name| self.channels.get(name).map_or(0.0, |c| c.noise_sd))
-                .collect(),
+            aleatoric_sd_mmhg: with(self.channels.iter().map(|(_, c)| c.noise_sd).collect(), &|_| 0.0),
             publish_period_ns: ns_from_s(1.0 / self.publish.rate_hz),
         })
     }

@@ -1,18 +1,20 @@
 //! The members, and one step of all of them over one window.
 
+use std::sync::OnceLock;
+
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use super::coupling::{coupled, coupled_unknowns, independent, independent_unknowns};
 use super::settings::{CouplingKind, EstimatorSettings, SettingsError};
-use super::statistics::{Summary, mean_and_sd, summarise};
+use super::statistics::{Explainers, Summary, mean_and_sd, summarise};
 use super::time::s_from_ns;
 use crate::model::{Model, ParameterInfo};
 use crate::xtfc::basis::Basis;
 use crate::xtfc::collocation::CollocationSolver;
 use crate::xtfc::dense;
-use crate::xtfc::features::RandomFeatures;
+use crate::xtfc::features::{FeatureError, RandomFeatures};
 use crate::xtfc::problem::{Datum, Prior, Solution, Unknowns, WindowProblem};
 
 /// A share of the prior variance that counts as learnt.
@@ -23,6 +25,9 @@ const INFORMED: f64 = 1e-4;
 pub trait Parallel: Sync {
     /// Calls `job(index, member)` for every member.
     fn for_each(&self, members: &mut [Member], job: &(dyn Fn(usize, &mut Member) + Sync));
+
+    /// Calls `job(index)` for every index below `count`.
+    fn for_indices(&self, count: usize, job: &(dyn Fn(usize) + Sync));
 }
 
 /// One after the other.
@@ -32,6 +37,10 @@ pub struct Serial;
 impl Parallel for Serial {
     fn for_each(&self, members: &mut [Member], job: &(dyn Fn(usize, &mut Member) + Sync)) {
         members.iter_mut().enumerate().for_each(|(i, member)| job(i, member));
+    }
+
+    fn for_indices(&self, count: usize, job: &(dyn Fn(usize) + Sync)) {
+        (0..count).for_each(job);
     }
 }
 
@@ -108,7 +117,12 @@ impl<M: Model> Ensemble<M> {
     ///
     /// # Errors
     /// When the settings do not fit the model.
-    pub fn new(model: M, settings: EstimatorSettings, start_s: f64) -> Result<Self, SettingsError> {
+    pub fn new(
+        model: M,
+        settings: EstimatorSettings,
+        start_s: f64,
+        parallel: &dyn Parallel,
+    ) -> Result<Self, SettingsError> {
         check(&model, &settings)?;
         let estimated = with_companions(&model, &settings.estimate);
         let transforms: Vec<_> = estimated.iter().map(|&p| model.parameters()[p].transform).collect();
@@ -121,7 +135,7 @@ impl<M: Model> Ensemble<M> {
         model.advance(start_s, &mut theta);
 
         let (n, m) = (model.n_states(), settings.members);
-        let bases = draw_bases(&settings, &mut rng)?;
+        let bases = draw_bases(&model, &settings, &mut rng, parallel)?;
         let states = centred_normals(n, m, &mut rng);
         let guesses = centred_normals(estimated.len(), m, &mut rng);
         let members = bases.into_iter().enumerate().map(|(i, basis)| {
@@ -191,17 +205,15 @@ impl<M: Model> Ensemble<M> {
         report
     }
 
-    /// Random walk of the parameters and process noise of the pressures over one window.
+    /// Random walk of the parameters and process noise of the states over one window.
     fn drift(&mut self) {
-        let drift = self.settings.drift;
+        let drift = &self.settings.drift;
         let root_h = s_from_ns(self.settings.window.length_ns).sqrt();
         let parameters = self.model.parameters();
         for member in &mut self.members {
-            if drift.pressures_mmhg > 0.0 {
-                for x in &mut member.x {
-                    let e: f64 = StandardNormal.sample(&mut self.rng);
-                    *x += drift.pressures_mmhg * root_h * e;
-                }
+            for (x, sd) in member.x.iter_mut().zip(&drift.states).filter(|(_, sd)| **sd > 0.0) {
+                let e: f64 = StandardNormal.sample(&mut self.rng);
+                *x += sd * root_h * e;
             }
             if drift.parameters > 0.0 {
                 for &p in &self.estimated {
@@ -331,8 +343,9 @@ impl<M: Model> Ensemble<M> {
         mean_and_sd(&values).1
     }
 
-    /// States and derived quantities at position `s` of the last window: one summary per quantity, states first.
-    pub fn summarise_at(&self, s: f64, scratch: &mut Snapshot) -> Vec<Summary> {
+    /// States and derived quantities of all members at position `s` of the last window, `[n_quantities x n_members]`,
+    /// states first.
+    pub fn snapshot<'a>(&self, s: f64, scratch: &'a mut Snapshot) -> &'a mut [f64] {
         let (n, m) = (self.model.n_states(), self.members.len());
         let n_q = n + self.model.derived().len();
         scratch.values.resize(n_q * m, 0.0);
@@ -341,14 +354,31 @@ impl<M: Model> Ensemble<M> {
         for (i, member) in self.members.iter().enumerate() {
             scratch.phi.resize(member.basis.rank(), 0.0);
             let (x, derived) = scratch.row.split_at_mut(n);
-            member.solution.state_at(&member.basis, s, &mut scratch.phi, x);
+            member.solution.state_at(&self.model, &member.basis, s, &mut scratch.phi, x);
             self.model.derive(t, x, &member.solution.theta, derived);
             for (q, value) in scratch.row.iter().enumerate() {
                 scratch.values[q * m + i] = *value;
             }
         }
+        &mut scratch.values
+    }
+
+    /// One summary per quantity of [`Ensemble::snapshot`].
+    pub fn summarise_at(&self, s: f64, scratch: &mut Snapshot) -> Vec<Summary> {
+        let (n, m) = (self.model.n_states(), self.members.len());
+        let values = self.snapshot(s, scratch);
+        let explainers = Explainers::new(&values[(n - self.model.n_discrepancies()) * m..n * m], m);
         let noise = |q: usize| self.settings.aleatoric_sd_mmhg.get(q).copied().unwrap_or(0.0);
-        scratch.values.chunks_exact_mut(m).enumerate().map(|(q, row)| summarise(row, noise(q), 0.0)).collect()
+        let summary = |(q, row): (usize, &mut [f64])| {
+            let share = explainers.share_of(row);
+            summarise(row, noise(q), share)
+        };
+        values.chunks_exact_mut(m).enumerate().map(summary).collect()
+    }
+
+    /// A parameter of every member at the end of the last window.
+    pub fn parameter_of_members(&self, parameter: usize) -> impl ExactSizeIterator<Item = f64> + '_ {
+        self.members.iter().map(move |member| member.theta[parameter])
     }
 
     /// The estimated parameters at the end of the last window.
@@ -439,7 +469,8 @@ impl Member {
                 CouplingKind::Coupled => shared_root,
                 CouplingKind::Independent => {
                     let weight = settings.weights.parameter;
-                    independent::prior_root(&self.theta, &unknowns.parameters, weight, &mut self.root);
+                    let infos = model.parameters();
+                    independent::prior_root(&self.theta, infos, &unknowns.parameters, weight, &mut self.root);
                     &self.root
                 }
             };
@@ -487,6 +518,7 @@ fn check<M: Model>(model: &M, settings: &EstimatorSettings) -> Result<(), Settin
     length("initial_state_sd", settings.initial_state_sd.len(), n)?;
     length("weights.physics", settings.weights.physics.len(), n)?;
     length("aleatoric_sd", settings.aleatoric_sd_mmhg.len(), n)?;
+    length("drift.states", settings.drift.states.len(), n)?;
     if settings.members < 2 {
         return Err(SettingsError::Members(settings.members));
     }
@@ -499,9 +531,15 @@ fn check<M: Model>(model: &M, settings: &EstimatorSettings) -> Result<(), Settin
             return Err(SettingsError::NotPositive(what));
         }
     }
-    let noise_is_positive = settings.channels.iter().all(|c| c.noise_sd_mmhg > 0.0 && c.state < n);
-    if !noise_is_positive {
+    if !settings.channels.iter().all(|c| c.noise_sd_mmhg > 0.0) {
         return Err(SettingsError::NotPositive("the noise of every channel"));
+    }
+    if !settings.weights.physics.iter().all(|w| *w > 0.0) {
+        return Err(SettingsError::NotPositive("the weight of every equation"));
+    }
+    let observable = |state: usize| state < n - model.n_discrepancies() && !model.is_free(state);
+    if let Some(channel) = settings.channels.iter().find(|c| !observable(c.state)) {
+        return Err(SettingsError::State(channel.state));
     }
     let estimable = |&p: &usize| model.parameters().get(p).is_some_and(|info| info.estimable);
     match settings.estimate.iter().find(|p| !estimable(p)) {
@@ -524,9 +562,24 @@ pub fn with_companions<M: Model>(model: &M, estimate: &[usize]) -> Vec<usize> {
     all
 }
 
-fn draw_bases(settings: &EstimatorSettings, rng: &mut ChaCha8Rng) -> Result<Vec<Basis>, SettingsError> {
+fn draw_bases<M: Model>(
+    model: &M,
+    settings: &EstimatorSettings,
+    rng: &mut ChaCha8Rng,
+    parallel: &dyn Parallel,
+) -> Result<Vec<Basis>, SettingsError> {
     let length_s = s_from_ns(settings.window.length_ns);
-    (0..settings.members).map(|_| Ok(Basis::new(RandomFeatures::draw(settings.features, rng)?, length_s)?)).collect()
+    let free = (0..model.n_states()).any(|state| model.is_free(state));
+    let draws = (0..settings.members).map(|_| RandomFeatures::draw(settings.features, rng));
+    let features = draws.collect::<Result<Vec<_>, _>>()?;
+    let slots: Vec<OnceLock<Result<Basis, FeatureError>>> = features.iter().map(|_| OnceLock::new()).collect();
+    parallel.for_indices(features.len(), &|i| {
+        let basis = Basis::new(features[i].clone(), length_s);
+        // Every index comes once, so that the slot is empty.
+        let _ = slots[i].set(if free { basis.and_then(Basis::with_free) } else { basis });
+    });
+    // A slot that was never filled is a broken `Parallel`, and then there is no basis either.
+    slots.into_iter().map(|slot| Ok(slot.into_inner().unwrap_or(Err(FeatureError::Degenerate))?)).collect()
 }
 
 /// `rows x columns` standard normals, row-major; every row is centred, its variance kept at 1.

@@ -4,7 +4,9 @@
 
 use std::collections::BTreeMap;
 
-use super::ensemble::{Ensemble, Observation, Parallel, ParameterSummary, Snapshot, WindowReport, with_companions};
+use super::ensemble::{
+    Ensemble, Observation, Parallel, ParameterSummary, Serial, Snapshot, WindowReport, with_companions,
+};
 use super::settings::{EstimatorSettings, SettingsError};
 use super::statistics::Summary;
 use super::time::{ArrivalTime, EventTime, NS_PER_S};
@@ -188,7 +190,12 @@ impl<M: Model> Estimator<M> {
     /// When the settings do not fit the model.
     pub fn new(model: M, settings: EstimatorSettings) -> Result<Self, SettingsError> {
         // Drawn once here, so that unusable settings are refused before anything starts.
-        Ensemble::new(model.clone(), EstimatorSettings { members: 2.min(settings.members), ..settings.clone() }, 0.0)?;
+        Ensemble::new(
+            model.clone(),
+            EstimatorSettings { members: 2.min(settings.members), ..settings.clone() },
+            0.0,
+            &Serial,
+        )?;
         Ok(Self {
             cutter: WindowCutter::new(settings.window, &settings.channels),
             tallies: vec![ChannelTally::default(); settings.channels.len()],
@@ -319,7 +326,7 @@ impl<M: Model> Estimator<M> {
     fn solve(&mut self, window: &ClosedWindow, parallel: &dyn Parallel, out: &mut Vec<Output>) {
         let first = self.ensemble.is_none();
         if first {
-            let drawn = Ensemble::new(self.model.clone(), self.settings.clone(), window.start.as_s());
+            let drawn = Ensemble::new(self.model.clone(), self.settings.clone(), window.start.as_s(), parallel);
             // Checked when the estimator was made; a failure here leaves the bed without estimates, visibly.
             let Ok(ensemble) = drawn else {
                 out.push(notice(window.start, NoticeKind::WindowFailed, None));

@@ -39,21 +39,21 @@ pub struct WindowSettings {
 /// Weights of the rows; see [`problem`](crate::xtfc::problem).
 #[derive(Debug, Clone, PartialEq)]
 pub struct RowWeights {
-    /// Physics rows \[s/mmHg\], per equation.
+    /// Physics rows \[s/mmHg\], per equation: `lambda_1`, and what is believed of discrepancies.
     pub physics: Vec<f64>,
-    /// Data rows \[1/mmHg\] in `independent`; `coupled` uses the reciprocal of the noise.
+    /// Data rows \[1/mmHg\] in `independent`, `lambda_2`; `coupled` uses the reciprocal of the noise.
     pub data: f64,
     /// `w_theta` of `independent`: pull of a parameter to its value in the previous window.
     pub parameter: f64,
 }
 
 /// What the coupled ensemble assumes to change by itself.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Drift {
     /// Random walk of every estimated coordinate (relative, for positive parameters), sd per square root of a second.
     pub parameters: f64,
-    /// Process noise of every pressure \[mmHg\], sd per square root of a second.
-    pub pressures_mmhg: f64,
+    /// Process noise of every state, in its own unit, sd per square root of a second; `[n_states]`.
+    pub states: Vec<f64>,
     /// Multiplicative inflation of the prior covariance, per second; 1 is none.
     pub inflation: f64,
 }
@@ -73,9 +73,9 @@ pub struct EstimatorSettings {
     pub theta: Vec<f64>,
     /// Spread of the starting guesses of estimated parameters (relative, for positive ones); `coupled` only.
     pub initial_guess_sd: f64,
-    /// Initial pressures \[mmHg\], `[n_states]`.
+    /// Initial states (pressures \[mmHg\], discrepancies), `[n_states]`.
     pub initial_state: Vec<f64>,
-    /// Their spread \[mmHg\], `[n_states]`.
+    /// Their spread, `[n_states]`.
     pub initial_state_sd: Vec<f64>,
     /// Features of the members.
     pub features: FeatureSpec,
@@ -114,6 +114,9 @@ pub enum SettingsError {
     /// Not positive.
     #[error("{0} must be positive")]
     NotPositive(&'static str),
+    /// A state without a sensor.
+    #[error("no sensor measures state number {0}")]
+    State(usize),
     /// An index out of range, or a parameter the equations do not depend on.
     #[error("parameter number {0} cannot be estimated")]
     Parameter(usize),

@@ -7,11 +7,11 @@ pub struct Summary {
     pub mean: f64,
     /// Total standard deviation: root of the sum of squares of the three below.
     pub sd: f64,
-    /// Spread of the members: features, noise realisations, initial pressures, parameters.
+    /// Spread of the members: features, noise realisations, initial pressures, parameters. Without the model's part.
     pub epistemic_sd: f64,
     /// Sensor noise; 0 for what is derived.
     pub aleatoric_sd: f64,
-    /// Spread of the members' discrepancies; 0 without a discrepancy in the model.
+    /// What the members' discrepancies explain of their spread; 0 without a discrepancy in the model.
     pub model_sd: f64,
     /// 5 % quantile of the true quantity, without sensor noise.
     pub q05: f64,
@@ -19,20 +19,96 @@ pub struct Summary {
     pub q95: f64,
 }
 
-/// Summarises one quantity over the members; `values` is sorted on return.
+/// Summarises one quantity over the members; `values` is sorted on return. `model_share` is the share of their variance
+/// that belongs to the model ([`Explainers::share_of`]).
 #[must_use]
-pub fn summarise(values: &mut [f64], aleatoric_sd: f64, model_sd: f64) -> Summary {
-    let (mean, epistemic_sd) = mean_and_sd(values);
+pub fn summarise(values: &mut [f64], aleatoric_sd: f64, model_share: f64) -> Summary {
+    let (mean, spread) = mean_and_sd(values);
     values.sort_unstable_by(f64::total_cmp);
     Summary {
         mean,
-        sd: (epistemic_sd * epistemic_sd + aleatoric_sd * aleatoric_sd + model_sd * model_sd).sqrt(),
-        epistemic_sd,
+        sd: (spread * spread + aleatoric_sd * aleatoric_sd).sqrt(),
+        epistemic_sd: spread * (1.0 - model_share).sqrt(),
         aleatoric_sd,
-        model_sd,
+        model_sd: spread * model_share.sqrt(),
         q05: quantile(values, 0.05),
         q95: quantile(values, 0.95),
     }
+}
+
+/// Variables over the members (their discrepancies) that may explain the spread of others.
+#[derive(Debug, Clone, Default)]
+pub struct Explainers {
+    members: usize,
+    /// Orthonormal and centred, one per independent variable, `[n x n_members]`.
+    directions: Vec<f64>,
+}
+
+impl Explainers {
+    /// From the rows of `variables`, each `[n_members]`.
+    #[must_use]
+    pub fn new(variables: &[f64], members: usize) -> Self {
+        let mut all = Self { members, directions: Vec::new() };
+        for variable in variables.chunks_exact(members) {
+            let mut rest = centred(variable);
+            let before = norm(&rest);
+            // Twice, because once is not orthogonal to rounding.
+            for direction in all.directions.chunks_exact(members).chain(all.directions.chunks_exact(members)) {
+                let along: f64 = direction.iter().zip(&rest).map(|(a, b)| a * b).sum();
+                rest.iter_mut().zip(direction).for_each(|(r, d)| *r -= along * d);
+            }
+            let length = norm(&rest);
+            if length > 1e-9 * before {
+                all.directions.extend(rest.iter().map(|r| r / length));
+            }
+        }
+        all
+    }
+
+    /// The share of the variance of `values` `[n_members]` that a linear regression on these variables explains,
+    /// without what chance alone would explain (adjusted R squared, not below 0).
+    #[must_use]
+    #[allow(clippy::cast_precision_loss)]
+    pub fn share_of(&self, values: &[f64]) -> f64 {
+        let count = self.directions.len().checked_div(self.members).unwrap_or(0);
+        if count == 0 || self.members < count + 2 {
+            return 0.0;
+        }
+        let centred = centred(values);
+        let along = |direction: &[f64]| direction.iter().zip(&centred).map(|(a, b)| a * b).sum::<f64>().powi(2);
+        let explained: f64 = self.directions.chunks_exact(self.members).map(along).sum();
+        let total = norm(&centred).powi(2);
+        if total <= 0.0 {
+            return 0.0;
+        }
+        let chance = (self.members as f64 - 1.0) / (self.members - 1 - count) as f64;
+        (1.0 - (1.0 - explained / total) * chance).clamp(0.0, 1.0)
+    }
+}
+
+#[allow(clippy::cast_precision_loss)]
+fn centred(values: &[f64]) -> Vec<f64> {
+    let mean = values.iter().sum::<f64>() / values.len() as f64;
+    values.iter().map(|v| v - mean).collect()
+}
+
+fn norm(values: &[f64]) -> f64 {
+    values.iter().map(|v| v * v).sum::<f64>().sqrt()
+}
+
+/// Correlation of the rows of `values` `[n x n_members]`, `[n x n]`, row-major; NaN where a row has no spread.
+#[must_use]
+pub fn correlation(values: &[f64], members: usize) -> Vec<f64> {
+    let rows: Vec<Vec<f64>> = values
+        .chunks_exact(members)
+        .map(|row| {
+            let row = centred(row);
+            let length = norm(&row);
+            row.iter().map(|v| v / length).collect()
+        })
+        .collect();
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum();
+    rows.iter().flat_map(|a| rows.iter().map(|b| dot(a, b))).collect()
 }
 
 /// Mean and sample standard deviation (0 for fewer than two values, NaN for none).

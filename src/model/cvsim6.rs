@@ -3,7 +3,7 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::capacitance::{Activation, Capacitance, ValueAndRate};
-use super::{Model, ParameterInfo, Quantity, Transform};
+use super::{InductancePath, Model, ParameterInfo, Quantity, Transform};
 use crate::named_vector;
 
 /// Pascals-in-cgs per mmHg: the literature states CVSim-6 in Ba, the program computes in mmHg.
@@ -119,6 +119,30 @@ named_vector! {
         blood_volume: BloodVolume,
         /// Beats since event time 0 at the start of the window; a beat begins at every integer. The clock parameter.
         beat_phase: BeatPhase,
+        /// What the flow into the left ventricle lacks \[mL/s\].
+        delta_q_li: DeltaQLi,
+        /// What the flow out of the left ventricle lacks \[mL/s\].
+        delta_q_lo: DeltaQLo,
+        /// What the systemic flow lacks \[mL/s\].
+        delta_q_a: DeltaQA,
+        /// What the flow into the right ventricle lacks \[mL/s\].
+        delta_q_ri: DeltaQRi,
+        /// What the flow out of the right ventricle lacks \[mL/s\].
+        delta_q_ro: DeltaQRo,
+        /// What the pulmonary flow lacks \[mL/s\].
+        delta_q_pv: DeltaQPv,
+        /// What `dP_l/dt` lacks \[mmHg/s\].
+        delta_p_l: DeltaPL,
+        /// What `dP_a/dt` lacks \[mmHg/s\].
+        delta_p_a: DeltaPA,
+        /// What `dP_v/dt` lacks \[mmHg/s\].
+        delta_p_v: DeltaPV,
+        /// What `dP_r/dt` lacks \[mmHg/s\].
+        delta_p_r: DeltaPR,
+        /// What `dP_pa/dt` lacks \[mmHg/s\].
+        delta_p_pa: DeltaPPa,
+        /// What `dP_pv/dt` lacks \[mmHg/s\].
+        delta_p_pv: DeltaPPv,
     }
 }
 
@@ -194,6 +218,18 @@ pub const PARAMETERS: &[ParameterInfo] = &[
         transform: Transform::Linear { scale: 1.0 },
         estimable: true,
     },
+    missing_flow("delta_q_li"),
+    missing_flow("delta_q_lo"),
+    missing_flow("delta_q_a"),
+    missing_flow("delta_q_ri"),
+    missing_flow("delta_q_ro"),
+    missing_flow("delta_q_pv"),
+    missing_rate("delta_p_l"),
+    missing_rate("delta_p_a"),
+    missing_rate("delta_p_v"),
+    missing_rate("delta_p_r"),
+    missing_rate("delta_p_pa"),
+    missing_rate("delta_p_pv"),
 ];
 
 const fn mmhg(name: &'static str) -> Quantity {
@@ -218,6 +254,16 @@ const fn resistance(name: &'static str, ba_s_per_ml: f64) -> ParameterInfo {
     let default = ba_s_per_ml / BA_PER_MMHG;
     let bounds = (default * 1e-2, default * 1e2);
     ParameterInfo { name, unit: "mmHg s/mL", default, bounds, transform: Transform::Log, estimable: true }
+}
+
+const fn missing_flow(name: &'static str) -> ParameterInfo {
+    let transform = Transform::Linear { scale: 10.0 };
+    ParameterInfo { name, unit: "mL/s", default: 0.0, bounds: (-1e4, 1e4), transform, estimable: true }
+}
+
+const fn missing_rate(name: &'static str) -> ParameterInfo {
+    let transform = Transform::Linear { scale: 1.0 };
+    ParameterInfo { name, unit: "mmHg/s", default: 0.0, bounds: (-1e5, 1e5), transform, estimable: true }
 }
 
 const fn fixed_volume(name: &'static str, default: f64) -> ParameterInfo {
@@ -296,6 +342,11 @@ impl Flow {
         }
     }
 
+    /// With what the flow lacks.
+    fn plus(self, missing: f64) -> Self {
+        Self { value: self.value + missing, ..self }
+    }
+
     /// Through the nonlinear pulmonary resistance `R(Q) = scale * table(Q)`.
     fn through_table(upstream: f64, downstream: f64, r_pv: f64) -> Self {
         let scale = r_pv / PARAMETERS[Parameter::RPv as usize].default;
@@ -342,8 +393,21 @@ struct Moment {
 }
 
 impl Moment {
-    /// `f`, row by row.
+    /// `f`: the balances, and what they lack.
     fn rhs(&self) -> Pressures {
+        let (balance, theta) = (self.balances(), &self.theta);
+        Pressures {
+            p_l: balance.p_l + theta.delta_p_l,
+            p_a: balance.p_a + theta.delta_p_a,
+            p_v: balance.p_v + theta.delta_p_v,
+            p_r: balance.p_r + theta.delta_p_r,
+            p_pa: balance.p_pa + theta.delta_p_pa,
+            p_pv: balance.p_pv + theta.delta_p_pv,
+        }
+    }
+
+    /// The balances of the compartments, row by row.
+    fn balances(&self) -> Pressures {
         let Self { p, theta, c_l, c_r, q, .. } = self;
         let (c_l, c_r) = (c_l.value_and_rate(), c_r.value_and_rate());
         Pressures {
@@ -393,12 +457,12 @@ impl Cvsim6 {
             c_l: Capacitance::new(activation, theta.c_l_dia, theta.c_l_sys),
             c_r: Capacitance::new(activation, theta.c_r_dia, theta.c_r_sys),
             q: Flows {
-                li: Flow::through_valve(p.p_pv, p.p_l, theta.r_li),
-                lo: Flow::through_valve(p.p_l, p.p_a, theta.r_lo),
-                a: Flow::through(p.p_a, p.p_v, theta.r_a),
-                ri: Flow::through_valve(p.p_v, p.p_r, theta.r_ri),
-                ro: Flow::through_valve(p.p_r, p.p_pa, theta.r_ro),
-                pv: pulmonary(p.p_pa, p.p_pv, theta.r_pv),
+                li: Flow::through_valve(p.p_pv, p.p_l, theta.r_li).plus(theta.delta_q_li),
+                lo: Flow::through_valve(p.p_l, p.p_a, theta.r_lo).plus(theta.delta_q_lo),
+                a: Flow::through(p.p_a, p.p_v, theta.r_a).plus(theta.delta_q_a),
+                ri: Flow::through_valve(p.p_v, p.p_r, theta.r_ri).plus(theta.delta_q_ri),
+                ro: Flow::through_valve(p.p_r, p.p_pa, theta.r_ro).plus(theta.delta_q_ro),
+                pv: pulmonary(p.p_pa, p.p_pv, theta.r_pv).plus(theta.delta_q_pv),
             },
         }
     }
@@ -460,15 +524,15 @@ impl Cvsim6 {
 }
 
 impl Model for Cvsim6 {
-    fn states(&self) -> &'static [Quantity] {
+    fn states(&self) -> &[Quantity] {
         STATES
     }
 
-    fn parameters(&self) -> &'static [ParameterInfo] {
+    fn parameters(&self) -> &[ParameterInfo] {
         PARAMETERS
     }
 
-    fn derived(&self) -> &'static [Quantity] {
+    fn derived(&self) -> &[Quantity] {
         DERIVED
     }
 
@@ -509,7 +573,7 @@ impl Model for Cvsim6 {
 
     fn parameter_jacobian(&self, t_s: f64, x: &[f64], theta: &[f64], which: &[usize], dfdtheta: &mut [f64]) {
         let moment = self.moment(t_s, x, theta);
-        let f = moment.rhs();
+        let f = moment.balances();
         let width = which.len();
         for (column, &p) in which.iter().enumerate() {
             let d = moment.rhs_by_parameter(&f, p);
@@ -539,6 +603,20 @@ impl Model for Cvsim6 {
         .write_to(out);
     }
 
+    fn inductance_path(&self, parameter: usize) -> Option<InductancePath> {
+        let path = |from: State, to: State, resistance: Parameter| {
+            Some(InductancePath { from: from as usize, to: to as usize, resistance: resistance as usize })
+        };
+        // Through a closed valve nothing flows, whatever its inertia: only the open vessels have one.
+        if parameter == Parameter::DeltaQA as usize {
+            path(State::A, State::V, Parameter::RA)
+        } else if parameter == Parameter::DeltaQPv as usize {
+            path(State::Pa, State::Pv, Parameter::RPv)
+        } else {
+            None
+        }
+    }
+
     fn advance(&self, dt_s: f64, theta: &mut [f64]) {
         let rate = theta[Parameter::HeartRate as usize] / 60.0;
         // Not wrapped: the spread of the phase over an ensemble must not jump at the onset of a beat.
@@ -559,7 +637,7 @@ impl Model for Cvsim6 {
 }
 
 impl Moment {
-    /// The column of `df/dtheta` that belongs to one parameter; `f` is the right-hand side.
+    /// The column of `df/dtheta` that belongs to one parameter; `f` are the balances.
     fn rhs_by_parameter(&self, f: &Pressures, parameter: usize) -> Pressures {
         use Parameter as P;
         let zero = Pressures { p_l: 0.0, p_a: 0.0, p_v: 0.0, p_r: 0.0, p_pa: 0.0, p_pv: 0.0 };
@@ -604,6 +682,43 @@ impl Moment {
             Pressures { p_r: -q.ro.by_resistance / c_r, p_pa: q.ro.by_resistance / theta.c_pa, ..zero }
         } else if is(P::RPv) {
             Pressures { p_pa: -q.pv.by_resistance / theta.c_pa, p_pv: q.pv.by_resistance / theta.c_pv, ..zero }
+        } else {
+            self.rhs_by_missing(parameter)
+        }
+    }
+
+    /// The same for what flows and balances lack.
+    fn rhs_by_missing(&self, parameter: usize) -> Pressures {
+        use Parameter as P;
+        let zero = Pressures { p_l: 0.0, p_a: 0.0, p_v: 0.0, p_r: 0.0, p_pa: 0.0, p_pv: 0.0 };
+        let theta = &self.theta;
+        let (c_l, c_r) = (self.c_l.value_and_rate().value, self.c_r.value_and_rate().value);
+        let is = |p: Parameter| parameter == p as usize;
+
+        if is(P::DeltaQLi) {
+            Pressures { p_pv: -1.0 / theta.c_pv, p_l: 1.0 / c_l, ..zero }
+        } else if is(P::DeltaQLo) {
+            Pressures { p_l: -1.0 / c_l, p_a: 1.0 / theta.c_a, ..zero }
+        } else if is(P::DeltaQA) {
+            Pressures { p_a: -1.0 / theta.c_a, p_v: 1.0 / theta.c_v, ..zero }
+        } else if is(P::DeltaQRi) {
+            Pressures { p_v: -1.0 / theta.c_v, p_r: 1.0 / c_r, ..zero }
+        } else if is(P::DeltaQRo) {
+            Pressures { p_r: -1.0 / c_r, p_pa: 1.0 / theta.c_pa, ..zero }
+        } else if is(P::DeltaQPv) {
+            Pressures { p_pa: -1.0 / theta.c_pa, p_pv: 1.0 / theta.c_pv, ..zero }
+        } else if is(P::DeltaPL) {
+            Pressures { p_l: 1.0, ..zero }
+        } else if is(P::DeltaPA) {
+            Pressures { p_a: 1.0, ..zero }
+        } else if is(P::DeltaPV) {
+            Pressures { p_v: 1.0, ..zero }
+        } else if is(P::DeltaPR) {
+            Pressures { p_r: 1.0, ..zero }
+        } else if is(P::DeltaPPa) {
+            Pressures { p_pa: 1.0, ..zero }
+        } else if is(P::DeltaPPv) {
+            Pressures { p_pv: 1.0, ..zero }
         } else {
             zero
         }

@@ -7,16 +7,22 @@
 //! Invariants: pure functions of their arguments; units mmHg, mL, s; exact Jacobians (no finite differences).
 //! Deliberately absent: absolute time, noise, files, configuration, logging.
 //!
-//! # How to add a model
-//!
-//! One file: equations, parameter table with units, citation, then the code row by row.
-//! 1. Declare states, parameters and derived quantities with [`crate::named_vector!`] and a [`ParameterInfo`] table.
-//! 2. Implement [`Model`]; time-dependent forcing goes through a *clock parameter* ([`Model::advance`]).
-//! 3. Add the model to the Jacobian property test in `tests/it/model.rs`.
+//! [`adding_a_model`] is the recipe for another one.
 
 pub mod capacitance;
 pub mod cvsim6;
+pub mod discrepancy;
+pub mod harmonic;
+pub mod lorenz;
+pub mod oscillator;
 pub mod truth;
+
+pub mod adding_a_model {
+    #![doc = include_str!("adding_a_model.md")]
+    #![doc = "```rust,ignore"]
+    #![doc = include_str!("harmonic.rs")]
+    #![doc = "```"]
+}
 
 /// Declares a struct of `f64` fields together with its names, its order and its vector form.
 ///
@@ -130,6 +136,17 @@ pub struct ParameterInfo {
     pub estimable: bool,
 }
 
+/// A vessel along which a pressure difference accelerates blood.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct InductancePath {
+    /// The state upstream.
+    pub from: usize,
+    /// The state downstream.
+    pub to: usize,
+    /// The parameter that is the vessel's resistance.
+    pub resistance: usize,
+}
+
 /// A system of ordinary differential equations with exact first derivatives.
 ///
 /// Time `t` is measured from the start of the current window. Whatever must survive from window to window
@@ -137,13 +154,13 @@ pub struct ParameterInfo {
 /// [`Model::advance`] moves on.
 pub trait Model: Clone + Send + Sync + 'static {
     /// The states, in order.
-    fn states(&self) -> &'static [Quantity];
+    fn states(&self) -> &[Quantity];
 
     /// The parameters, in order.
-    fn parameters(&self) -> &'static [ParameterInfo];
+    fn parameters(&self) -> &[ParameterInfo];
 
     /// Quantities that follow from states and parameters, in order.
-    fn derived(&self) -> &'static [Quantity];
+    fn derived(&self) -> &[Quantity];
 
     /// `dx = f(t, x, theta)`; `x`, `dx`: `[n_states]`, `theta`: `[n_parameters]`.
     fn rhs(&self, t_s: f64, x: &[f64], theta: &[f64], dx: &mut [f64]);
@@ -166,6 +183,24 @@ pub trait Model: Clone + Send + Sync + 'static {
     ///
     /// Integrators restart there. Kinks that depend on the state (valves) are not reported.
     fn next_corner(&self, t_s: f64, until_s: f64, theta: &[f64]) -> Option<f64>;
+
+    /// Whether a state is a function of time of which nothing is known: no equation, no continuity. `f` is then not
+    /// its derivative but its value, as far as anything is believed of it.
+    fn is_free(&self, state: usize) -> bool {
+        let _ = state;
+        false
+    }
+
+    /// How many of the states, the last ones, are discrepancies: what the equations lack, not what the body has.
+    fn n_discrepancies(&self) -> usize {
+        0
+    }
+
+    /// Where the flow that a parameter adds to runs, if inertia can be ascribed to it.
+    fn inductance_path(&self, parameter: usize) -> Option<InductancePath> {
+        let _ = parameter;
+        None
+    }
 
     /// Number of states.
     fn n_states(&self) -> usize {

@@ -9,7 +9,7 @@ use crate::estimate::ensemble::Parallel;
 use crate::estimate::estimator::{ChannelHealth, Estimator, Input, Notice, NoticeKind, Output, REPORT_EVERY_NS};
 use crate::estimate::time::{ArrivalTime, EventTime, s_from_ns};
 use crate::estimate::window::{Liveness, RawSample};
-use crate::model::cvsim6::Cvsim6;
+use crate::model::discrepancy::Circulation;
 
 /// Longest lag that the histogram tells apart \[us\].
 const MAX_LAG_US: u64 = 600_000_000;
@@ -85,7 +85,7 @@ pub struct Health {
 pub struct Bed {
     /// Its name.
     pub name: String,
-    estimator: Estimator<Cvsim6>,
+    estimator: Estimator<Circulation>,
     clock: Clock,
     windows: u64,
     windows_without_data: u64,
@@ -106,7 +106,7 @@ pub struct Bed {
 impl Bed {
     /// A bed that waits for its first sample.
     #[must_use]
-    pub fn new(name: String, estimator: Estimator<Cvsim6>, clock: Clock) -> Self {
+    pub fn new(name: String, estimator: Estimator<Circulation>, clock: Clock) -> Self {
         let channels = estimator.settings().channels.len();
         Self {
             name,
@@ -129,7 +129,7 @@ impl Bed {
 
     /// The estimator.
     #[must_use]
-    pub fn estimator(&self) -> &Estimator<Cvsim6> {
+    pub fn estimator(&self) -> &Estimator<Circulation> {
         &self.estimator
     }
 

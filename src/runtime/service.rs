@@ -14,7 +14,7 @@ use super::workers::Workers;
 use crate::estimate::estimator::{Estimator, Output};
 use crate::estimate::settings::{EstimatorSettings, SettingsError};
 use crate::estimate::time::ArrivalTime;
-use crate::model::cvsim6::Cvsim6;
+use crate::model::discrepancy::Circulation;
 
 /// How often beds without input are told that time has passed.
 const TICK: Duration = Duration::from_millis(20);
@@ -102,7 +102,7 @@ struct Slot {
 
 /// The service.
 pub struct Service {
-    model: Cvsim6,
+    model: Circulation,
     settings: EstimatorSettings,
     limits: Limits,
     workers: Arc<Workers>,
@@ -123,14 +123,14 @@ impl Service {
     /// # Errors
     /// When no estimator can be made of the settings.
     pub fn new(
-        model: Cvsim6,
+        model: Circulation,
         settings: EstimatorSettings,
         limits: Limits,
         workers: Arc<Workers>,
         sink: Arc<dyn Sink>,
         clock: Clock,
     ) -> Result<(Self, Inlet), SettingsError> {
-        Estimator::new(model, settings.clone())?;
+        Estimator::new(model.clone(), settings.clone())?;
         let (sender, events) = mpsc::channel(limits.queue_tasks.saturating_mul(16).clamp(1024, 65_536));
         // Unbounded in type only: there is at most one return per bed.
         let (returns, returned) = mpsc::unbounded_channel();
@@ -204,7 +204,7 @@ impl Service {
     }
 
     fn new_bed(&self, name: &str) -> Option<Box<Bed>> {
-        let estimator = Estimator::new(self.model, self.settings.clone()).ok()?;
+        let estimator = Estimator::new(self.model.clone(), self.settings.clone()).ok()?;
         Some(Box::new(Bed::new(name.to_owned(), estimator, self.clock)))
     }
 

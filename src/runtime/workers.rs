@@ -1,6 +1,6 @@
 //! A fixed pool of threads for the solves.
 
-use rayon::iter::{IndexedParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
+use rayon::iter::{IndexedParallelIterator, IntoParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
 
 use crate::estimate::ensemble::{Member, Parallel};
 
@@ -40,6 +40,11 @@ impl Workers {
         self.pool.current_num_threads()
     }
 
+    /// Runs `job` so that what it does in parallel uses this pool.
+    pub fn install<T: Send>(&self, job: impl FnOnce() -> T + Send) -> T {
+        self.pool.install(job)
+    }
+
     /// Runs `job` on some thread of the pool, some time.
     pub fn spawn(&self, job: impl FnOnce() + Send + 'static) {
         self.pool.spawn(job);
@@ -55,5 +60,9 @@ impl Parallel for Workers {
                 members.par_iter_mut().enumerate().with_min_len(CHUNK).for_each(|(i, member)| job(i, member));
             });
         }
+    }
+
+    fn for_indices(&self, count: usize, job: &(dyn Fn(usize) + Sync)) {
+        self.pool.install(|| (0..count).into_par_iter().with_min_len(CHUNK).for_each(job));
     }
 }

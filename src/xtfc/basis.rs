@@ -13,9 +13,16 @@
 //!
 //! With as many directions as nodes the basis is rotated further until the node derivatives are the identity:
 //! `beta` then *is* `dx/dt` \[mmHg/s\] at the nodes, and the method is a collocation Runge-Kutta scheme.
+//!
+//! A function of which nothing is known at the start of the window has a free expression `sigma(s)^T a = psi(s)^T beta`
+//! instead, with the values orthonormalised ([`Basis::with_free`]), and with values at the nodes for `beta` where
+//! possible.
+
+use std::sync::OnceLock;
 
 use faer::Mat;
 
+use super::dense::one_thread;
 use super::features::{FeatureError, RandomFeatures, gauss_legendre};
 
 /// Singular values below this share of the largest are rounding, not functions.
@@ -44,6 +51,18 @@ pub struct Basis {
     end: Vec<f64>,
     nodal: bool,
     condition: f64,
+    free: Option<FreeExpression>,
+}
+
+/// `psi`, for functions without continuity.
+#[derive(Debug, Clone)]
+struct FreeExpression {
+    /// From features to directions, `[n_features x rank]`, row-major.
+    transform: Vec<f64>,
+    /// `psi` at the nodes, `[n_nodes x rank]`, row-major.
+    values: Vec<f64>,
+    /// `psi` at the end of the window, `[rank]`.
+    end: Vec<f64>,
 }
 
 impl Basis {
@@ -52,9 +71,9 @@ impl Basis {
     /// # Errors
     /// When the features span nothing.
     pub fn new(features: RandomFeatures, length_s: f64) -> Result<Self, FeatureError> {
-        let (transform, condition) = orthonormalise(&features)?;
+        let (transform, condition) = orthonormalise(&features, slopes)?;
         let positions = features.spec.placement.positions(features.spec.nodes);
-        let nodal = nodal_rotation(&features, &positions, &transform);
+        let nodal = nodal_rotation(&transform, positions.len(), || slopes(&features, &positions));
         let (transform, is_nodal) = nodal.map_or((transform, false), |rotated| (rotated, true));
 
         let rank = transform.ncols();
@@ -69,6 +88,7 @@ impl Basis {
             end: vec![0.0; rank],
             nodal: is_nodal,
             condition,
+            free: None,
             features,
             positions: positions.clone(),
         };
@@ -80,6 +100,28 @@ impl Basis {
         basis.values_at(1.0, &mut end);
         (basis.values, basis.rates, basis.end) = (values, rates, end);
         Ok(basis)
+    }
+
+    /// With the free expression as well, in as many directions as the constrained one.
+    ///
+    /// # Errors
+    /// When the features span nothing.
+    pub fn with_free(mut self) -> Result<Self, FeatureError> {
+        let rank = self.rank;
+        let (all, _) = orthonormalise(&self.features, values)?;
+        // The features have no more to say than their derivatives, up to a constant: directions beyond are dropped,
+        // missing ones are zero, which the general solver copes with.
+        let transform = Mat::from_fn(all.nrows(), rank, |i, j| if j < all.ncols() { all[(i, j)] } else { 0.0 });
+        let at_nodes = values(&self.features, &self.positions);
+        let nodal =
+            if self.nodal { nodal_rotation(&transform, self.positions.len(), || at_nodes.clone()) } else { None };
+        self.nodal = nodal.is_some();
+        let transform = nodal.unwrap_or(transform);
+        let at_end = values(&self.features, &[1.0]) * &transform;
+        let at_nodes = at_nodes * &transform;
+        let flat = |m: &Mat<f64>| (0..m.nrows()).flat_map(|i| (0..rank).map(move |j| m[(i, j)])).collect();
+        self.free = Some(FreeExpression { transform: flat(&transform), values: flat(&at_nodes), end: flat(&at_end) });
+        Ok(self)
     }
 
     /// Number of directions, the coefficients per state.
@@ -118,7 +160,19 @@ impl Basis {
         &self.end
     }
 
-    /// Whether the coefficients are the derivatives at the nodes.
+    /// `psi` at the nodes, `[n_nodes x rank]`; the identity if [`Basis::is_nodal`], empty without a free expression.
+    #[must_use]
+    pub fn free_values(&self) -> &[f64] {
+        self.free.as_ref().map_or(&[], |free| &free.values)
+    }
+
+    /// `psi` at the end of the window; empty without a free expression.
+    #[must_use]
+    pub fn free_end(&self) -> &[f64] {
+        self.free.as_ref().map_or(&[], |free| &free.end)
+    }
+
+    /// Whether the coefficients are the derivatives (the values, where free) at the nodes.
     #[must_use]
     pub fn is_nodal(&self) -> bool {
         self.nodal
@@ -133,22 +187,45 @@ impl Basis {
     /// `phi(s)` \[s\] into `out` `[rank]`.
     pub fn values_at(&self, s: f64, out: &mut [f64]) {
         let shifted = self.features.at(s).zip(&self.at_start).map(|((value, _), start)| value - start);
-        self.combine(shifted, self.length_s, out);
+        combine(shifted, self.length_s, &self.transform, out);
+    }
+
+    /// `psi(s)` into `out` `[rank]`; zero without a free expression.
+    pub fn free_values_at(&self, s: f64, out: &mut [f64]) {
+        match &self.free {
+            Some(free) => combine(self.features.at(s).map(|(value, _)| value), 1.0, &free.transform, out),
+            None => out.fill(0.0),
+        }
     }
 
     /// `phi'(s)` into `out` `[rank]`.
     pub fn rates_at(&self, s: f64, out: &mut [f64]) {
-        self.combine(self.features.at(s).map(|(_, slope)| slope), 1.0, out);
+        combine(self.features.at(s).map(|(_, slope)| slope), 1.0, &self.transform, out);
     }
+}
 
-    fn combine(&self, features: impl Iterator<Item = f64>, scale: f64, out: &mut [f64]) {
-        out.fill(0.0);
-        for (feature, row) in features.zip(self.transform.chunks_exact(self.rank)) {
-            for (o, t) in out.iter_mut().zip(row) {
-                *o += scale * feature * t;
-            }
+/// `scale transform^T features` into `out` `[rank]`.
+fn combine(features: impl Iterator<Item = f64>, scale: f64, transform: &[f64], out: &mut [f64]) {
+    out.fill(0.0);
+    for (feature, row) in features.zip(transform.chunks_exact(out.len())) {
+        for (o, t) in out.iter_mut().zip(row) {
+            *o += scale * feature * t;
         }
     }
+}
+
+/// A rule of at least `points` points. Every member needs the same one, and finding it costs more than using it.
+fn quadrature(points: usize) -> &'static [(f64, f64)] {
+    static RULES: [OnceLock<Vec<(f64, f64)>>; 6] = [const { OnceLock::new() }; 6];
+    // 32, 64, ... 1024 points, the last for any number of features that a member can have.
+    let size = (0..RULES.len() - 1).find(|size| 32 << size >= points).unwrap_or(RULES.len() - 1);
+    RULES[size].get_or_init(|| gauss_legendre(32 << size))
+}
+
+/// Values of the features at positions `s`, `[s.len() x n_features]`.
+fn values(features: &RandomFeatures, s: &[f64]) -> Mat<f64> {
+    let rows: Vec<Vec<f64>> = s.iter().map(|&s| features.at(s).map(|(value, _)| value).collect()).collect();
+    Mat::from_fn(s.len(), features.count(), |i, j| rows[i][j])
 }
 
 /// Derivatives of the features at positions `s`, `[s.len() x n_features]`.
@@ -157,17 +234,20 @@ fn slopes(features: &RandomFeatures, s: &[f64]) -> Mat<f64> {
     Mat::from_fn(s.len(), features.count(), |i, j| rows[i][j])
 }
 
-/// The transform that makes the derivatives orthonormal in `L2(0, 1)`, and the condition number it removed.
-fn orthonormalise(features: &RandomFeatures) -> Result<(Mat<f64>, f64), FeatureError> {
-    let points = (4 * features.count()).max(32);
-    let rule = gauss_legendre(points);
+/// The transform that makes values or derivatives orthonormal in `L2(0, 1)`, and the condition number it removed.
+fn orthonormalise(
+    features: &RandomFeatures,
+    evaluate: fn(&RandomFeatures, &[f64]) -> Mat<f64>,
+) -> Result<(Mat<f64>, f64), FeatureError> {
+    let rule = quadrature(2 * features.count());
     let s: Vec<f64> = rule.iter().map(|(x, _)| 0.5 * (1.0 + x)).collect();
-    let mut m = slopes(features, &s);
+    let mut m = evaluate(features, &s);
     for (i, (_, weight)) in rule.iter().enumerate() {
         for j in 0..m.ncols() {
             m[(i, j)] *= (0.5 * weight).sqrt();
         }
     }
+    one_thread();
     let svd = m.thin_svd().map_err(|_| FeatureError::Degenerate)?;
     let sigma: Vec<f64> = svd.S().column_vector().iter().copied().collect();
     let largest = sigma.first().copied().unwrap_or(0.0);
@@ -180,12 +260,14 @@ fn orthonormalise(features: &RandomFeatures) -> Result<(Mat<f64>, f64), FeatureE
     Ok((transform, largest / sigma[rank - 1]))
 }
 
-/// The rotation that makes the node derivatives the identity, where there are as many directions as nodes.
-fn nodal_rotation(features: &RandomFeatures, positions: &[f64], transform: &Mat<f64>) -> Option<Mat<f64>> {
-    if positions.len() != transform.ncols() {
+/// The transform rotated so that what it makes of the features `at_nodes` `[n_nodes x n_features]` is the identity,
+/// where there are as many directions as nodes.
+fn nodal_rotation(transform: &Mat<f64>, nodes: usize, at_nodes: impl FnOnce() -> Mat<f64>) -> Option<Mat<f64>> {
+    if nodes != transform.ncols() {
         return None;
     }
-    let at_nodes = slopes(features, positions) * transform;
+    let at_nodes = at_nodes() * transform;
+    one_thread();
     let svd = at_nodes.thin_svd().ok()?;
     let sigma: Vec<f64> = svd.S().column_vector().iter().copied().collect();
     let (largest, smallest) = (*sigma.first()?, *sigma.last()?);

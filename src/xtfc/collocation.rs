@@ -103,7 +103,8 @@ impl CollocationSolver {
                     }
                 };
                 if unknowns.initial_state {
-                    (0..n).for_each(|j| add(self.jacobians[(node * n + i) * n + j], j));
+                    let starting = (0..n).filter(|j| !problem.model.is_free(*j));
+                    starting.for_each(|j| add(self.jacobians[(node * n + i) * n + j], j));
                 }
                 for (k, (&p, transform)) in unknowns.parameters.iter().zip(&unknowns.transforms).enumerate() {
                     let slope = transform.slope(self.point.theta[p]);
@@ -274,19 +275,19 @@ struct Blocks {
 }
 
 impl Blocks {
-    /// Builds `A = I - df/dx phi` and factorises; returns the worst pivot ratio.
+    /// Builds `A = I - df/dx phi` (`psi = I` in place of `phi` for free functions) and factorises; returns the worst pivot ratio.
     fn assemble_and_factorise<M: Model>(&mut self, problem: &WindowProblem<'_, M>, jacobians: &[f64]) -> f64 {
         let n = problem.start.len();
         let nodes = problem.basis.positions().len();
         self.n_nodes = nodes;
         self.partition(n, jacobians);
-        let phi = problem.basis.values();
         let mut worst = 1.0_f64;
         for (states, lu) in self.states.iter().zip(&mut self.factors) {
             let size = states.len() * nodes;
             let a = lu.matrix(size);
             for (bi, &i) in states.iter().enumerate() {
                 for (bj, &j) in states.iter().enumerate() {
+                    let phi = problem.expression(j);
                     for node in 0..nodes {
                         let slope = jacobians[(node * n + i) * n + j];
                         let row = &mut a[(bi * nodes + node) * size + bj * nodes..][..nodes];

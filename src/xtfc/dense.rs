@@ -77,9 +77,9 @@ fn rows<M: Model>(point: &Point, problem: &WindowProblem<'_, M>, phi: &[f64]) ->
         for i in 0..n {
             let (row, w) = (i * nodes + node, problem.physics_weights[i]);
             for k in 0..rank {
-                a[(row, i * rank + k)] += w * problem.basis.rates()[node * rank + k];
+                a[(row, i * rank + k)] += w * problem.left_hand_side(i)[node * rank + k];
                 for j in 0..n {
-                    a[(row, j * rank + k)] -= w * dfdx[i * n + j] * problem.basis.values()[node * rank + k];
+                    a[(row, j * rank + k)] -= w * dfdx[i * n + j] * problem.expression(j)[node * rank + k];
                 }
             }
             for k in 0..n_xi {
@@ -120,8 +120,11 @@ fn rhs_by_xi<M: Model>(point: &Point, problem: &WindowProblem<'_, M>, t: f64, x:
     let mut out = vec![0.0; n * n_xi];
     for i in 0..n {
         for k in 0..n_xi {
-            let by_state: f64 =
-                if unknowns.initial_state { (0..n).map(|j| dfdx[i * n + j] * root(j, k)).sum() } else { 0.0 };
+            let mut by_state = 0.0;
+            if unknowns.initial_state {
+                let starting = (0..n).filter(|j| !problem.model.is_free(*j));
+                by_state = starting.map(|j| dfdx[i * n + j] * root(j, k)).sum();
+            }
             let by_parameter: f64 = (0..free)
                 .map(|p| {
                     let slope = unknowns.transforms[p].slope(point.theta[unknowns.parameters[p]]);
@@ -134,11 +137,18 @@ fn rhs_by_xi<M: Model>(point: &Point, problem: &WindowProblem<'_, M>, t: f64, x:
     out
 }
 
+/// Keeps the linear algebra on the thread that asks for it: members are solved in parallel, one of them is too small to
+/// share out, and how it is shared out must not change a digit.
+pub(super) fn one_thread() {
+    faer::set_global_parallelism(faer::Par::Seq);
+}
+
 /// The step that minimises `|a step + b|`, and the condition estimate.
 ///
 /// Public so that the tests can hold it against a plain singular value decomposition.
 #[must_use]
 pub fn least_squares(a: &Mat<f64>, b: &[f64]) -> (Vec<f64>, f64) {
+    one_thread();
     let columns = a.ncols();
     if a.nrows() >= columns {
         let qr = a.col_piv_qr();
@@ -157,6 +167,7 @@ pub fn least_squares(a: &Mat<f64>, b: &[f64]) -> (Vec<f64>, f64) {
 /// The same through the singular value decomposition, which also serves dependent columns.
 #[must_use]
 pub fn shortest_least_squares(a: &Mat<f64>, b: &[f64]) -> (Vec<f64>, f64) {
+    one_thread();
     let Ok(svd) = a.thin_svd() else {
         return (vec![f64::NAN; a.ncols()], f64::INFINITY);
     };
@@ -197,10 +208,11 @@ fn take_step<M: Model>(point: &Point, problem: &WindowProblem<'_, M>, phi: &[f64
     next
 }
 
-/// Whether the step moves no pressure and no coordinate by more than the tolerance.
+/// Whether the step moves no state and no coordinate by more than the tolerance.
 fn step_is_small<M: Model>(problem: &WindowProblem<'_, M>, step: &[f64], n_beta: usize) -> bool {
     let tolerance = problem.stopping.tolerance_mmhg;
     let rank = problem.basis.rank();
-    let pressures = step[..n_beta].chunks_exact(rank).map(|beta| dot(problem.basis.end(), beta).abs());
-    pressures.fold(0.0, f64::max) <= tolerance && step[n_beta..].iter().all(|s| s.abs() <= tolerance)
+    let end = |i: usize| if problem.model.is_free(i) { problem.basis.free_end() } else { problem.basis.end() };
+    let states = step[..n_beta].chunks_exact(rank).enumerate().map(|(i, beta)| dot(end(i), beta).abs());
+    states.fold(0.0, f64::max) <= tolerance && step[n_beta..].iter().all(|s| s.abs() <= tolerance)
 }

@@ -9,6 +9,9 @@
 //!          + |xi|^2                                                                prior
 //! ```
 //!
+//! For a state of which nothing is known ([`Model::is_free`]) the physics row is `w_i (x_i - f_i)`, and its network
+//! stands for its values without continuity.
+//!
 //! Writing the prior through a root of its covariance (`covariance = root root^T`) serves both couplings, and a
 //! singular covariance as well: directions without spread simply cannot move.
 
@@ -19,7 +22,7 @@ use crate::model::{Model, Transform};
 pub struct Datum {
     /// Position in the window, in `[0, 1]`.
     pub s: f64,
-    /// The state it observes.
+    /// The state it observes; not a free one.
     pub state: usize,
     /// Observed value \[mmHg\].
     pub value: f64,
@@ -100,10 +103,23 @@ pub struct WindowProblem<'a, M> {
     pub prior: Prior<'a>,
     /// Samples.
     pub data: &'a [Datum],
-    /// Weight of the physics rows \[s/mmHg\], per equation `[n_states]`.
+    /// Weight of the physics rows \[s/mmHg\], per equation `[n_states]`: the paper's `lambda_1`.
     pub physics_weights: &'a [f64],
     /// When to stop.
     pub stopping: Stopping,
+}
+
+impl<'a, M: Model> WindowProblem<'a, M> {
+    /// What stands left of the equals sign in the equation of a state, at the nodes, `[n_nodes x rank]`: the derivative,
+    /// or the value of a free function.
+    pub(super) fn left_hand_side(&self, state: usize) -> &'a [f64] {
+        if self.model.is_free(state) { self.basis.free_values() } else { self.basis.rates() }
+    }
+
+    /// How a state depends on its coefficients at the nodes, `[n_nodes x rank]`.
+    pub(super) fn expression(&self, state: usize) -> &'a [f64] {
+        if self.model.is_free(state) { self.basis.free_values() } else { self.basis.values() }
+    }
 }
 
 /// How a solve went.
@@ -141,10 +157,16 @@ pub struct Solution {
 
 impl Solution {
     /// State at position `s` of the window into `out` `[n_states]`; `phi` is scratch `[rank]`.
-    pub fn state_at(&self, basis: &super::basis::Basis, s: f64, phi: &mut [f64], out: &mut [f64]) {
+    pub fn state_at<M: Model>(&self, model: &M, basis: &super::basis::Basis, s: f64, phi: &mut [f64], out: &mut [f64]) {
         basis.values_at(s, phi);
         for ((o, start), beta) in out.iter_mut().zip(&self.start).zip(self.beta.chunks_exact(phi.len())) {
             *o = start + dot(phi, beta);
+        }
+        if (0..out.len()).any(|i| model.is_free(i)) {
+            basis.free_values_at(s, phi);
+            for (i, beta) in self.beta.chunks_exact(phi.len()).enumerate().filter(|(i, _)| model.is_free(*i)) {
+                out[i] = dot(phi, beta);
+            }
         }
     }
 
@@ -193,8 +215,8 @@ impl Point {
         self.theta.extend_from_slice(problem.theta);
         if problem.basis.is_nodal() {
             problem.model.rhs(0.0, &self.start, &self.theta, &mut self.f[..n]);
-            for (row, f) in self.beta.chunks_exact_mut(rank).zip(&self.f[..n]) {
-                row.fill(*f);
+            for (i, (row, f)) in self.beta.chunks_exact_mut(rank).zip(&self.f[..n]).enumerate() {
+                row.fill(if problem.model.is_free(i) { problem.start[i] } else { *f });
             }
         }
     }
@@ -220,9 +242,15 @@ impl Point {
     /// States at the nodes, and the data residual.
     pub(super) fn evaluate_states<M: Model>(&mut self, problem: &WindowProblem<'_, M>, phi: &[f64]) {
         let (n, rank) = (self.start.len(), problem.basis.rank());
-        for (x, values) in self.x.chunks_exact_mut(n).zip(problem.basis.values().chunks_exact(rank)) {
+        for (node, x) in self.x.chunks_exact_mut(n).enumerate() {
+            let here = node * rank..(node + 1) * rank;
             for (i, x) in x.iter_mut().enumerate() {
-                *x = self.start[i] + dot(values, &self.beta[i * rank..(i + 1) * rank]);
+                let beta = &self.beta[i * rank..(i + 1) * rank];
+                *x = if problem.model.is_free(i) {
+                    dot(&problem.basis.free_values()[here.clone()], beta)
+                } else {
+                    self.start[i] + dot(&problem.basis.values()[here.clone()], beta)
+                };
             }
         }
         for ((residual, datum), phi) in self.data.iter_mut().zip(problem.data).zip(phi.chunks_exact(rank)) {
@@ -238,13 +266,10 @@ impl Point {
         let nodes = problem.basis.positions().len();
         for i in 0..n {
             let beta = &self.beta[i * rank..(i + 1) * rank];
+            let rows = problem.left_hand_side(i);
             for node in 0..nodes {
-                let rate = if problem.basis.is_nodal() {
-                    beta[node]
-                } else {
-                    dot(&problem.basis.rates()[node * rank..][..rank], beta)
-                };
-                self.physics[i * nodes + node] = rate - self.f[node * n + i];
+                let left = if problem.basis.is_nodal() { beta[node] } else { dot(&rows[node * rank..][..rank], beta) };
+                self.physics[i * nodes + node] = left - self.f[node * n + i];
             }
         }
     }
@@ -274,8 +299,13 @@ impl Point {
         out.start.clone_from(&self.start);
         out.theta.clone_from(&self.theta);
         out.end.clear();
-        let ends = self.beta.chunks_exact(rank).map(|beta| dot(problem.basis.end(), beta));
-        out.end.extend(ends.zip(&self.start).map(|(change, start)| start + change));
+        for (i, (beta, start)) in self.beta.chunks_exact(rank).zip(&self.start).enumerate() {
+            out.end.push(if problem.model.is_free(i) {
+                dot(problem.basis.free_end(), beta)
+            } else {
+                start + dot(problem.basis.end(), beta)
+            });
+        }
         out.account = Account { physics_rms: rms(&self.physics), data_rms: rms(&self.data), ..account };
     }
 }

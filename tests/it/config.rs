@@ -166,7 +166,7 @@ fn later_layers_win_and_origins_say_so() {
 fn origins_list_every_setting_once_in_the_order_of_the_schema() {
     let (_, origins) = load(&[], &[]).unwrap();
     let keys: Vec<_> = origins.iter().map(|setting| setting.key.as_str()).collect();
-    assert_eq!(keys[..3], ["observed", "patient.heart_rate", "patient.p_th"]);
+    assert_eq!(keys[..3], ["observed", "discrepancy", "patient.heart_rate"]);
     assert_eq!(keys.last(), Some(&"zenoh.connect"));
     let mut unique = keys.clone();
     unique.sort_unstable();

@@ -27,13 +27,13 @@ const PARAMETERS: &[ParameterInfo] = &[ParameterInfo {
 }];
 
 impl Model for Linear {
-    fn states(&self) -> &'static [Quantity] {
+    fn states(&self) -> &[Quantity] {
         STATES
     }
-    fn parameters(&self) -> &'static [ParameterInfo] {
+    fn parameters(&self) -> &[ParameterInfo] {
         PARAMETERS
     }
-    fn derived(&self) -> &'static [Quantity] {
+    fn derived(&self) -> &[Quantity] {
         &[]
     }
     fn rhs(&self, _: f64, x: &[f64], theta: &[f64], dx: &mut [f64]) {
@@ -79,7 +79,7 @@ fn settings(members: usize) -> EstimatorSettings {
             forecast_limit_ns: 1_000_000_000,
         },
         weights: RowWeights { physics: vec![1e4; 2], data: 1.0, parameter: 10.0 },
-        drift: Drift { parameters: DRIFT_U, pressures_mmhg: DRIFT_X, inflation: 1.0 },
+        drift: Drift { parameters: DRIFT_U, states: vec![DRIFT_X; 2], inflation: 1.0 },
         stopping: Stopping::default(),
         channels: vec![ChannelSettings { state: 0, noise_sd_mmhg: NOISE, plausible_mmhg: (-1e3, 1e3) }],
         aleatoric_sd_mmhg: vec![NOISE, 0.0],
@@ -95,7 +95,7 @@ fn transition(dt: f64) -> Matrix3<f64> {
 #[test]
 fn coupled_is_the_kalman_filter_of_a_linear_model() {
     let members = 2000;
-    let mut ensemble = Ensemble::new(Linear, settings(members), 0.0).unwrap();
+    let mut ensemble = Ensemble::new(Linear, settings(members), 0.0, &Serial).unwrap();
     let mut rng = ChaCha8Rng::seed_from_u64(3);
     let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
     let mut truth = Vector3::new(0.0, 0.5, 2.5);

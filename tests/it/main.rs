@@ -5,8 +5,10 @@
 
 mod cli;
 mod config;
+mod discrepancy;
 mod kalman;
 mod model;
+mod reproduce;
 mod service;
 mod stream;
 mod support;

@@ -2,6 +2,10 @@
 
 use hemostream::model::Model;
 use hemostream::model::cvsim6::{Cvsim6, PARAMETERS, Parameter, PulmonaryResistance, SystoleRule};
+use hemostream::model::discrepancy::{Discrepancy, Discrepant, Form};
+use hemostream::model::harmonic::{Harmonic, Law};
+use hemostream::model::lorenz::{self, Lorenz};
+use hemostream::model::oscillator::{self, Oscillator};
 use hemostream::model::truth::{Change, Simulator};
 use proptest::prelude::*;
 
@@ -61,44 +65,41 @@ fn assert_columns_agree(exact: &[f64], difference: &[f64], scale: f64, what: &st
     }
 }
 
-/// Analytic Jacobians against finite differences at a random state, away from the kinks of valves and activation.
-fn check_jacobians(model: Cvsim6, x: &[f64], scale: &[f64], phase: f64) {
-    let mut theta: Vec<f64> = PARAMETERS.iter().zip(scale).map(|(p, s)| p.default * s).collect();
-    theta[Parameter::BeatPhase as usize] = phase;
-    theta[Parameter::Systole as usize] = 0.33 * scale[1];
-    let t = 0.0007;
+/// Analytic Jacobians against finite differences, away from kinks.
+pub fn check_jacobians<M: Model>(model: &M, t: f64, x: &[f64], theta: &[f64]) {
+    let n = model.n_states();
     let rhs = |x: &[f64], theta: &[f64]| {
-        let mut dx = vec![0.0; 6];
+        let mut dx = vec![0.0; n];
         model.rhs(t, x, theta, &mut dx);
         dx
     };
-    let (mut f, mut dfdx) = (vec![0.0; 6], vec![0.0; 36]);
-    model.rhs_and_state_jacobian(t, x, &theta, &mut f, &mut dfdx);
-    assert_eq!(f, rhs(x, &theta));
+    let (mut f, mut dfdx) = (vec![0.0; n], vec![f64::NAN; n * n]);
+    model.rhs_and_state_jacobian(t, x, theta, &mut f, &mut dfdx);
+    assert_eq!(f, rhs(x, theta));
     // Differences lose digits to the size of f.
     let floor = 1e-3 * f.iter().fold(1.0_f64, |m, v| m.max(v.abs()));
-    for j in 0..6 {
+    for j in 0..n {
         let perturbed = |value: f64| {
             let mut x = x.to_vec();
             x[j] = value;
-            rhs(&x, &theta)
+            rhs(&x, theta)
         };
-        let exact: Vec<f64> = (0..6).map(|i| dfdx[i * 6 + j]).collect();
-        assert_columns_agree(&exact, &derivative(perturbed, x[j], 1e-3), floor, &format!("state {j}"));
+        let exact: Vec<f64> = (0..n).map(|i| dfdx[i * n + j]).collect();
+        assert_columns_agree(&exact, &derivative(perturbed, x[j], 1e-3), floor, model.states()[j].name);
     }
-    let which: Vec<usize> = (0..PARAMETERS.len()).collect();
-    let mut by_parameter = vec![0.0; 6 * which.len()];
-    model.parameter_jacobian(t, x, &theta, &which, &mut by_parameter);
+    let which: Vec<usize> = (0..theta.len()).collect();
+    let mut by_parameter = vec![f64::NAN; n * which.len()];
+    model.parameter_jacobian(t, x, theta, &which, &mut by_parameter);
     for &p in &which {
         let perturbed = |value: f64| {
-            let mut theta = theta.clone();
+            let mut theta = theta.to_vec();
             theta[p] = value;
             rhs(x, &theta)
         };
-        let exact: Vec<f64> = (0..6).map(|i| by_parameter[i * which.len() + p]).collect();
+        let exact: Vec<f64> = (0..n).map(|i| by_parameter[i * which.len() + p]).collect();
         let step = 1e-4 * theta[p].abs().max(0.1);
         let floor = floor / theta[p].abs().max(0.1);
-        assert_columns_agree(&exact, &derivative(perturbed, theta[p], step), floor, PARAMETERS[p].name);
+        assert_columns_agree(&exact, &derivative(perturbed, theta[p], step), floor, model.parameters()[p].name);
     }
 }
 
@@ -107,7 +108,7 @@ proptest! {
 
     #[test]
     fn jacobians_are_exact(
-        x in proptest::collection::vec(0.0..120.0_f64, 6),
+        mut x in proptest::collection::vec(0.0..120.0_f64, 6),
         scale in proptest::collection::vec(0.7..1.4_f64, PARAMETERS.len()),
         phase in 0.02..0.95_f64,
         law in 0..3_usize,
@@ -127,7 +128,41 @@ proptest! {
         let drop = (x[4] - x[5]) / scale[18];
         let knots = [0.12 * 13.0, 5.8 * 104.9, 19.8 * 327.8].map(|k| k * 1000.0 / 60.0 / 1333.22);
         prop_assume!(knots.iter().all(|k| (drop - k).abs() > 0.05));
-        check_jacobians(Cvsim6 { systole, pulmonary_resistance }, &x, &scale, phase);
+        let mut theta: Vec<f64> = PARAMETERS.iter().zip(&scale).map(|(p, s)| p.default * s).collect();
+        theta[Parameter::BeatPhase as usize] = phase;
+        theta[Parameter::Systole as usize] = 0.33 * scale[1];
+        for (k, value) in theta[Parameter::DeltaQLi as usize..].iter_mut().enumerate() {
+            *value = 20.0 * (scale[k] - 1.0);
+        }
+        let model = Cvsim6 { systole, pulmonary_resistance };
+        check_jacobians(&model, 0.0007, &x, &theta);
+
+        let index = |p: Parameter| p as usize;
+        let discrepant = Discrepant::new(model, &[
+            Discrepancy { parameter: index(Parameter::DeltaQPv), form: Form::Inertial { ratio_s: 10.0 } },
+            Discrepancy { parameter: index(Parameter::DeltaPR), form: Form::Free },
+            Discrepancy { parameter: index(Parameter::DeltaQA), form: Form::Inertial { ratio_s: 3.0 } },
+            Discrepancy { parameter: index(Parameter::DeltaQLo), form: Form::Tracked },
+        ]).unwrap();
+        x.extend([7.0, -3.0, 20.0, 5.0]);
+        check_jacobians(&discrepant, 0.0007, &x, &theta);
+    }
+
+    #[test]
+    fn jacobians_of_the_small_models_are_exact(
+        x in proptest::collection::vec(-20.0..20.0_f64, 3),
+        theta in proptest::collection::vec(0.3..3.0_f64, 6),
+        t in 0.0..2.0_f64,
+    ) {
+        for law in [Law::Linear, Law::Growing] {
+            check_jacobians(&Harmonic { law }, t, &x[..1], &theta[..3]);
+        }
+        for known in [oscillator::Known::Everything, oscillator::Known::Nothing] {
+            check_jacobians(&Oscillator { known }, t, &x[..2], &theta[..4]);
+        }
+        for known in [lorenz::Known::Everything, lorenz::Known::AllButXz, lorenz::Known::Nothing] {
+            check_jacobians(&Lorenz { known }, t, &x, &theta);
+        }
     }
 }
 
@@ -155,4 +190,20 @@ fn published_maxima_need_a_systole_in_seconds() {
     assert!(worst(SystoleRule::Seconds, 0.33) < 0.005);
     assert!(worst(SystoleRule::Fraction, 0.33) > 0.03);
     assert!(worst(SystoleRule::Bazett, 0.3) > 0.03);
+}
+
+/// The exact solution against the truth simulator: one proves the other.
+#[test]
+fn harmonic_solution_is_exact() {
+    for law in [Law::Linear, Law::Growing] {
+        let model = Harmonic { law };
+        let theta = vec![1.3, 0.0, 0.0];
+        let mut simulator = Simulator::new(model, vec![10.0], theta, vec![]);
+        for i in 1..=20 {
+            let t = 0.5 * f64::from(i);
+            simulator.advance_to(t).unwrap();
+            let exact = model.exact(t, 10.0, 1.3);
+            assert!((simulator.state()[0] - exact).abs() < 1e-6 * exact, "{law:?} at {t} s");
+        }
+    }
 }

@@ -84,7 +84,7 @@ impl Daemon {
         let settings = config.estimator_settings().unwrap();
         let sink = Arc::clone(&outlet);
         let (service, inlet) =
-            Service::new(config.patient.model(), settings, limits, workers, sink, Clock::start()).unwrap();
+            Service::new(config.circulation().unwrap(), settings, limits, workers, sink, Clock::start()).unwrap();
         let service = tokio::spawn(service.run());
         subscriptions.push(inlet::listen(&bus, config, inlet.clone()).unwrap());
         Self { bus, inlet, outlet, service, said, subscriptions }
@@ -447,7 +447,7 @@ fn parameter_bits(estimate: &ParameterEstimate) -> Vec<u64> {
 
 /// The same record through the state machine, without bus, service or threads.
 fn estimated_directly(config: &Config, blocks: usize) -> Vec<Estimate> {
-    let mut estimator = Estimator::new(config.patient.model(), config.estimator_settings().unwrap()).unwrap();
+    let mut estimator = Estimator::new(config.circulation().unwrap(), config.estimator_settings().unwrap()).unwrap();
     let mut outputs = Vec::new();
     for k in 0..blocks {
         for channel in 0..CHANNELS.len() {

@@ -386,15 +386,15 @@ impl Broken {
 }
 
 impl Model for Broken {
-    fn states(&self) -> &'static [Quantity] {
+    fn states(&self) -> &[Quantity] {
         self.0.states()
     }
 
-    fn parameters(&self) -> &'static [ParameterInfo] {
+    fn parameters(&self) -> &[ParameterInfo] {
         self.0.parameters()
     }
 
-    fn derived(&self) -> &'static [Quantity] {
+    fn derived(&self) -> &[Quantity] {
         self.0.derived()
     }
 

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-const LAYERS: [&str; 5] = ["model", "xtfc", "estimate", "runtime", "edge"];
+const LAYERS: [&str; 6] = ["model", "xtfc", "estimate", "runtime", "edge", "reproduce"];
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))

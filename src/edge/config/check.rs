@@ -10,9 +10,9 @@ use super::error::{ConfigError, Problem};
 use super::keys::{self, KeyPath};
 use super::layers::Stack;
 use super::patient::{InitialSd, Patient, ScriptEntry};
-use super::schema::{Config, Distribution, EstimatorSettings, PublishSettings, WindowSettings};
-use crate::model::ParameterInfo;
-use crate::model::cvsim6::{PARAMETERS, Pressures};
+use super::schema::{Config, DiscrepancyForm, Distribution, EstimatorSettings, PublishSettings, WindowSettings};
+use crate::model::cvsim6::{Cvsim6, PARAMETERS, Pressures};
+use crate::model::{Model, ParameterInfo};
 
 /// Pressures that a patient can start with \[mmHg\].
 const STARTING_MMHG: RangeInclusive<f64> = -50.0..=350.0;
@@ -62,6 +62,7 @@ pub(super) fn faults(config: &Config) -> Vec<Fault> {
         check.script(&config.patient);
         check.variability(&config.patient);
         check.estimator(&config.estimator);
+        check.discrepancy(config);
         check.window(&config.window);
         check.channels(config);
         check.publish(&config.publish);
@@ -234,6 +235,34 @@ impl Checker {
         self.number("estimator.tolerance", estimator.tolerance, &fraction, "");
     }
 
+    fn discrepancy(&mut self, config: &Config) {
+        let known: Vec<&str> = PARAMETERS.iter().filter_map(|info| info.name.strip_prefix("delta_")).collect();
+        for (name, settings) in &config.discrepancy {
+            let key = KeyPath::from("discrepancy").join(name);
+            let Some(info) = parameter(&format!("delta_{name}")) else {
+                self.name(key, name, &known);
+                continue;
+            };
+            if config.estimator.estimate.iter().any(|estimated| estimated == info.name) {
+                let message =
+                    format!("found \"{}\" in `estimator.estimate` as well, expected one of the two", info.name);
+                self.refuse(key.clone(), message);
+            }
+            let inertial: Vec<&str> = inertial().collect();
+            if settings.form == DiscrepancyForm::Inertial && !inertial.contains(&name.as_str()) {
+                let expected = inertial.join(" or ");
+                self.refuse(key.join("form"), format!("found \"inertial\", which only {expected} can be"));
+            }
+            let unit = format!(" {}", info.unit);
+            let limit = info.bounds.1;
+            let number = |value: Option<f64>| value.unwrap_or(limit);
+            self.number(key.join("change"), number(settings.change), &positive_to(limit), &unit);
+            self.number(key.join("magnitude"), number(settings.magnitude), &positive_to(limit), &unit);
+            self.number(key.join("inertance"), settings.inertance.unwrap_or(1.0), &positive_to(1e6), " s");
+            self.number(key.join("initial_sd"), settings.initial_sd.unwrap_or(0.0), &(0.0..=limit), &unit);
+        }
+    }
+
     fn estimate(&mut self, names: &[String]) {
         let estimable: Vec<_> = PARAMETERS.iter().filter(|info| info.estimable).map(|info| info.name).collect();
         for name in names {
@@ -354,11 +383,23 @@ fn parameter(name: &str) -> Option<&'static ParameterInfo> {
     PARAMETERS.iter().find(|info| info.name == name)
 }
 
+/// Flows that can have inertia.
+fn inertial() -> impl Iterator<Item = &'static str> {
+    let model = Cvsim6::default();
+    let infos = PARAMETERS.iter().enumerate().filter(move |(p, _)| model.inductance_path(*p).is_some());
+    infos.filter_map(|(_, info)| info.name.strip_prefix("delta_"))
+}
+
 /// Parameters that a script can change.
 fn scriptable(table: &str) -> Vec<&'static str> {
     let names = PARAMETERS.iter().map(|info| info.name);
-    // The volume enters only the start; the phase runs by itself, so a factor on it would mean nothing.
-    names.filter(|&name| name != "blood_volume" && !(table == "scale" && name == "beat_phase")).collect()
+    // The volume enters only the start; the phase runs by itself and nothing is lacking at first, so factors on them
+    // would mean nothing.
+    names
+        .filter(|&name| {
+            name != "blood_volume" && !(table == "scale" && (name == "beat_phase" || name.starts_with("delta_")))
+        })
+        .collect()
 }
 
 /// Whether text can be one or more chunks of a topic.

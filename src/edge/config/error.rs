@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use crate::model::discrepancy::DiscrepancyError;
+
 /// A configuration that is refused.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ConfigError {
@@ -34,6 +36,13 @@ pub enum ConfigError {
     /// Settings that are unknown, of the wrong type or out of range.
     #[error("{}", lines(.0))]
     Settings(Vec<Problem>),
+}
+
+impl ConfigError {
+    /// Discrepancies that the model does not have.
+    pub(in crate::edge) fn discrepancy(error: &DiscrepancyError) -> Self {
+        Self::Settings(vec![Problem::new("discrepancy", error.to_string())])
+    }
 }
 
 /// One setting that is refused.

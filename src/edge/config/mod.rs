@@ -30,8 +30,8 @@ pub use error::{ConfigError, Problem};
 pub use keys::known_keys;
 pub use patient::{InitialSd, Patient, PulmonaryLaw, ScriptEntry, Systole};
 pub use schema::{
-    Activation, ChannelSettings, Config, Coupling, Distribution, EstimatorSettings, Nodes, PerState, PublishSettings,
-    ServiceSettings, WindowSettings, ZenohMode, ZenohSettings,
+    Activation, ChannelSettings, Config, Coupling, DiscrepancyForm, DiscrepancySettings, Distribution,
+    EstimatorSettings, Nodes, PerState, PublishSettings, ServiceSettings, WindowSettings, ZenohMode, ZenohSettings,
 };
 
 impl Config {

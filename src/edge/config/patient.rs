@@ -60,7 +60,9 @@ macro_rules! patient {
             /// The full parameter vector of the model.
             #[must_use]
             pub fn theta(&self) -> Vec<f64> {
-                Parameters { $($parameter: self.$parameter,)+ systole: self.systole.value() }.to_vec()
+                // Nothing is missing from the patient itself.
+                let lacking = Parameters::from_slice(&Cvsim6::default().default_parameters());
+                Parameters { $($parameter: self.$parameter,)+ systole: self.systole.value(), ..lacking }.to_vec()
             }
         }
     };

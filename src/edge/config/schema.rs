@@ -18,6 +18,8 @@ use crate::model::cvsim6::Pressures;
 pub struct Config {
     /// Names of the states whose sensors are believed; other channels are received and ignored.
     pub observed: Vec<String>,
+    /// What the equations may lack, by flow (`q_pv`) or by state, for its balance (`p_a`).
+    pub discrepancy: BTreeMap<String, DiscrepancySettings>,
     /// The patient: parameters of the model, start, script.
     pub patient: Patient,
     /// What is estimated and how.
@@ -106,6 +108,39 @@ pub enum Coupling {
     Coupled,
     /// Every member fits its own perturbed data, as in the paper.
     Independent,
+}
+
+/// `[discrepancy.NAME]`; flows are in mL/s, what a balance lacks in mmHg/s.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DiscrepancySettings {
+    /// What is believed of it.
+    #[serde(deserialize_with = "by_name")]
+    pub form: DiscrepancyForm,
+    /// How fast it is believed to change: random walk, sd per square root of a second.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub change: Option<f64>,
+    /// How large a free one is believed to be at any time (sd).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub magnitude: Option<f64>,
+    /// Inductance of an inertial one over the resistance beside it \[s\].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub inertance: Option<f64>,
+    /// Spread at the start (sd).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub initial_sd: Option<f64>,
+}
+
+/// What is believed of a discrepancy.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum DiscrepancyForm {
+    /// Nothing, and it starts anew in every window.
+    Free,
+    /// It is the flow through an inductance beside the resistance.
+    Inertial,
+    /// It changes slowly.
+    Tracked,
 }
 
 /// `[window]`
@@ -263,6 +298,7 @@ impl Default for Config {
             observed: Pressures::NAMES.iter().map(|&name| name.to_owned()).collect(),
             patient: Patient::default(),
             estimator: EstimatorSettings::default(),
+            discrepancy: BTreeMap::new(),
             window: WindowSettings::default(),
             channels: default_channels(),
             labels: labels.map(|(label, state)| (label.to_owned(), state.to_owned())).into(),

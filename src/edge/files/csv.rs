@@ -11,6 +11,7 @@ use crate::estimate::statistics::Summary;
 use crate::estimate::time::EventTime;
 use crate::model::Model;
 use crate::model::cvsim6::{Cvsim6, Pressures};
+use crate::model::discrepancy::Circulation;
 
 /// A record or table that cannot be read or written.
 #[derive(Debug, thiserror::Error)]
@@ -215,7 +216,7 @@ impl TableWriter {
 
 /// Header of an estimate file: `time_s`, seven statistics per quantity, four per parameter.
 #[must_use]
-pub fn estimate_header(model: Cvsim6, estimated: &[usize]) -> Vec<String> {
+pub fn estimate_header(model: &Circulation, estimated: &[usize]) -> Vec<String> {
     let quantities = model.states().iter().chain(model.derived()).flat_map(|q| {
         ["mean", "sd", "q05", "q95", "epistemic_sd", "aleatoric_sd", "model_sd"].map(|s| format!("{}_{s}", q.name))
     });
