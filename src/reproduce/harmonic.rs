@@ -141,7 +141,7 @@ impl Setup {
 
 /// Times of the curves \[s\].
 pub(super) fn grid() -> Vec<f64> {
-    (0..=100).map(|i| HORIZON_S * f64::from(i) / 100.0).collect()
+    (0..=50).map(|i| HORIZON_S * f64::from(i) / 50.0).collect()
 }
 
 /// A noisy record at irregular times in `[0, until_s)`.
@@ -242,7 +242,7 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
         "x, rms error in [5, 10]",
         "not converged",
     ]);
-    let mut figure = Figure::new("Harmonic example", 2);
+    let mut figure = Figure::new("Harmonic example", 3);
     let cases = [
         ("b1", "B = 1", CouplingKind::Independent, 1, "0.9840 ± 0.0536", "17.12"),
         ("b15", "B = 15", CouplingKind::Independent, 15, "0.9765 ± 0.0747", "5.42"),

@@ -15,6 +15,13 @@ struct Variant {
     setup: Setup,
 }
 
+/// A panel of the picture.
+struct Group {
+    name: &'static str,
+    /// Position in the table, mean, two standard deviations.
+    bars: Vec<(f64, f64, f64)>,
+}
+
 pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
     let mut report = Report::new("harmonic-ablation", "Members, neurons, activations, initial distributions");
     report.text(
@@ -24,7 +31,7 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
     let samples = shared_record();
     let exact = |t: f64| Harmonic::default().exact(t, X0, K);
     let mut table = Table::new(["", "", "k", "rms error in [5, 10]", "epistemic sd in [5, 10]", "not converged"]);
-    let mut bars: Vec<(&str, Vec<(f64, f64, f64)>)> = Vec::new();
+    let mut groups: Vec<Group> = Vec::new();
     for variant in variants(context) {
         let (trace, _) = variant.setup.run(&samples, context)?;
         let (mean, sd) = k_of(&trace);
@@ -42,23 +49,23 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
             short(band),
             not_converged,
         ]);
-        if bars.last().is_none_or(|(group, _)| *group != variant.group) {
-            bars.push((variant.group, Vec::new()));
+        if groups.last().is_none_or(|group| group.name != variant.group) {
+            groups.push(Group { name: variant.group, bars: Vec::new() });
         }
-        if let Some((_, points)) = bars.last_mut() {
+        if let Some(Group { bars, .. }) = groups.last_mut() {
             #[allow(clippy::cast_precision_loss)]
-            points.push((points.len() as f64 + 1.0, mean, 2.0 * sd));
+            bars.push((bars.len() as f64 + 1.0, mean, 2.0 * sd));
         }
     }
     report.table(table);
     let mut figure = Figure::new("k with two standard deviations", 2);
-    for (group, points) in bars {
+    for Group { name, bars } in groups {
         #[allow(clippy::cast_precision_loss)]
-        let last = points.len() as f64 + 0.5;
-        let chart = Chart::new(group, "row of the table", "k")
+        let last = bars.len() as f64 + 0.5;
+        let chart = Chart::new(name, "row of the table", "k")
             .x_range(0.5, last)
             .dashed("truth", vec![(0.5, K), (last, K)], Colour::Black)
-            .error_bars("", points, Colour::Blue);
+            .error_bars("", bars, Colour::Blue);
         figure = figure.panel(chart);
     }
     report.picture("harmonic_ablation", figure, "Estimated k by group, in the order of the table.");

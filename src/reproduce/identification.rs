@@ -47,8 +47,11 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
          derivative within a short window amplifies noise, which is what a free function has to pay. `coupled` has \
          nothing to share here: a free function carries nothing from window to window.",
     );
-    let mut table = Table::new(["", "unknown", "relative L2 error, noiseless", "with noise"]);
-    let mut figure = Figure::new("Recovered right-hand sides", 3);
+    let mut page = Page {
+        report,
+        table: Table::new(["", "unknown", "relative L2 error, noiseless", "with noise"]),
+        figure: Figure::new("Recovered right-hand sides", 3),
+    };
 
     let everything = Oscillator::default();
     let theta = everything.default_parameters();
@@ -67,9 +70,7 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
         until_s: context.size(10.0, 2.0),
         noise_sd,
     };
-    for (clean, noisy) in [(task(NOISELESS_SD), task(1e-3))] {
-        figure = compare(context, &everything, &[1.0, 0.0], &clean, &noisy, &mut report, &mut table, figure)?;
-    }
+    page.compare(context, (&everything, &[1.0, 0.0]), &task(NOISELESS_SD), &task(1e-3))?;
 
     let everything = Lorenz::default();
     let theta = everything.default_parameters();
@@ -98,9 +99,9 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
         names: &["-x z"],
         ..black(noise_sd)
     };
-    for (clean, noisy) in [(black(NOISELESS_SD), black(0.04)), (gray(NOISELESS_SD), gray(0.04))] {
-        figure = compare(context, &everything, &start, &clean, &noisy, &mut report, &mut table, figure)?;
-    }
+    page.compare(context, (&everything, &start), &black(NOISELESS_SD), &black(0.04))?;
+    page.compare(context, (&everything, &start), &gray(NOISELESS_SD), &gray(0.04))?;
+    let Page { mut report, table, figure } = page;
     report.table(table);
     report.picture("identification", figure, "Noiseless: what was recovered (colour) on the truth (dashed).");
     Ok(report)
@@ -112,48 +113,53 @@ fn right_hand_side<M: Model>(model: &M, theta: &[f64], x: &[f64]) -> Vec<f64> {
     dx
 }
 
-/// Runs a task without and with noise, and writes both down.
-#[allow(clippy::too_many_arguments)]
-fn compare<T: Model, M: Model>(
-    context: &Context<'_>,
-    everything: &T,
-    start: &[f64],
-    clean: &Task<'_, M>,
-    noisy: &Task<'_, M>,
-    report: &mut Report,
-    table: &mut Table,
-    mut figure: Figure,
-) -> Result<Figure, StudyError> {
-    let (trace, exact) = clean.run(context, everything, start)?;
-    let (noisy_trace, _) = noisy.run(context, everything, start)?;
-    let first = start.len();
-    let mut rows: Vec<Vec<f64>> = trace.times_s.iter().map(|t| vec![*t]).collect();
-    let mut header = vec!["time_s".to_owned()];
-    for (k, name) in clean.names.iter().enumerate() {
-        let error = |trace: &Trace| {
-            let off = trace.quantity(first + k).zip(&exact).map(|((_, s), e)| s.mean - e[k]);
-            rms(off) / rms(exact.iter().map(|e| e[k]))
-        };
-        let (without, with) = (error(&trace), error(&noisy_trace));
-        let key = name.replace(['-', ' '], "").replace('/', "_");
-        report.figure(&format!("{}.{key}.relative_l2", clean.key), without);
-        report.figure(&format!("{}.{key}.relative_l2_noisy", clean.key), with);
-        table.row([clean.title.to_owned(), (*name).to_owned(), percent(without), percent(with)]);
-        let colour = [Colour::Blue, Colour::Orange, Colour::Green][k % 3];
-        let curve = trace.quantity(first + k).map(|(t, s)| (t, s.mean)).collect();
-        let truth = trace.times_s.iter().zip(&exact).map(|(t, e)| (*t, e[k])).collect();
-        let chart = Chart::new(format!("{}: {name}", clean.title), "t [s]", *name)
-            .line("recovered", curve, colour)
-            .dashed("truth", truth, Colour::Black);
-        figure = figure.panel(chart);
-        header.extend([key.clone(), format!("{key}_exact")]);
-        for ((row, (_, s)), e) in rows.iter_mut().zip(trace.quantity(first + k)).zip(&exact) {
-            row.extend([s.mean, e[k]]);
+/// What the study writes.
+struct Page {
+    report: Report,
+    table: Table,
+    figure: Figure,
+}
+
+impl Page {
+    /// Runs a task without and with noise, and writes both down; the truth is a model and where it starts.
+    fn compare<T: Model, M: Model>(
+        &mut self,
+        context: &Context<'_>,
+        (everything, start): (&T, &[f64]),
+        clean: &Task<'_, M>,
+        noisy: &Task<'_, M>,
+    ) -> Result<(), StudyError> {
+        let (trace, exact) = clean.run(context, everything, start)?;
+        let (noisy_trace, _) = noisy.run(context, everything, start)?;
+        let first = start.len();
+        let mut rows: Vec<Vec<f64>> = trace.times_s.iter().map(|t| vec![*t]).collect();
+        let mut header = vec!["time_s".to_owned()];
+        for (k, name) in clean.names.iter().enumerate() {
+            let error = |trace: &Trace| {
+                let off = trace.quantity(first + k).zip(&exact).map(|((_, s), e)| s.mean - e[k]);
+                rms(off) / rms(exact.iter().map(|e| e[k]))
+            };
+            let (without, with) = (error(&trace), error(&noisy_trace));
+            let key = name.replace(['-', ' '], "").replace('/', "_");
+            self.report.figure(&format!("{}.{key}.relative_l2", clean.key), without);
+            self.report.figure(&format!("{}.{key}.relative_l2_noisy", clean.key), with);
+            self.table.row([clean.title.to_owned(), (*name).to_owned(), percent(without), percent(with)]);
+            let colour = [Colour::Blue, Colour::Orange, Colour::Green][k % 3];
+            let curve = trace.quantity(first + k).map(|(t, s)| (t, s.mean)).collect();
+            let truth = trace.times_s.iter().zip(&exact).map(|(t, e)| (*t, e[k])).collect();
+            let chart = Chart::new(format!("{}: {name}", clean.title), "t [s]", *name)
+                .line("recovered", curve, colour)
+                .dashed("truth", truth, Colour::Black);
+            self.figure.panels.push(chart.into());
+            header.extend([key.clone(), format!("{key}_exact")]);
+            for ((row, (_, s)), e) in rows.iter_mut().zip(trace.quantity(first + k)).zip(&exact) {
+                row.extend([s.mean, e[k]]);
+            }
         }
+        self.report.figure(&format!("{}.mean_sd", clean.key), mean(trace.quantity(first).map(|(_, s)| s.model_sd)));
+        self.report.series(clean.key, header, rows);
+        Ok(())
     }
-    report.figure(&format!("{}.mean_sd", clean.key), mean(trace.quantity(first).map(|(_, s)| s.model_sd)));
-    report.series(clean.key, header, rows);
-    Ok(figure)
 }
 
 fn percent(share: f64) -> String {

@@ -94,8 +94,8 @@ impl Basis {
         };
         let (mut values, mut rates, mut end) = (basis.values.clone(), basis.rates.clone(), basis.end.clone());
         for (n, &s) in positions.iter().enumerate() {
-            basis.values_at(s, &mut values[n * rank..(n + 1) * rank]);
-            basis.rates_at(s, &mut rates[n * rank..(n + 1) * rank]);
+            let here = n * rank..(n + 1) * rank;
+            basis.values_and_rates_at(s, &mut values[here.clone()], &mut rates[here]);
         }
         basis.values_at(1.0, &mut end);
         (basis.values, basis.rates, basis.end) = (values, rates, end);
@@ -190,17 +190,20 @@ impl Basis {
         combine(shifted, self.length_s, &self.transform, out);
     }
 
+    /// `phi(s)` \[s\] and `phi'(s)`, each `[rank]`.
+    fn values_and_rates_at(&self, s: f64, values: &mut [f64], rates: &mut [f64]) {
+        let features: Vec<(f64, f64)> = self.features.at(s).collect();
+        let shifted = features.iter().zip(&self.at_start).map(|((value, _), start)| value - start);
+        combine(shifted, self.length_s, &self.transform, values);
+        combine(features.iter().map(|(_, slope)| *slope), 1.0, &self.transform, rates);
+    }
+
     /// `psi(s)` into `out` `[rank]`; zero without a free expression.
     pub fn free_values_at(&self, s: f64, out: &mut [f64]) {
         match &self.free {
             Some(free) => combine(self.features.at(s).map(|(value, _)| value), 1.0, &free.transform, out),
             None => out.fill(0.0),
         }
-    }
-
-    /// `phi'(s)` into `out` `[rank]`.
-    pub fn rates_at(&self, s: f64, out: &mut [f64]) {
-        combine(self.features.at(s).map(|(_, slope)| slope), 1.0, &self.transform, out);
     }
 }
 

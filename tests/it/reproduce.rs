@@ -74,5 +74,5 @@ fn a_report_is_written_with_everything_it_refers_to() {
     assert!(error.as_f64().unwrap() < 0.1, "{error}");
     let table = crate::support::read_table(&folder.path().join("harmonic_discrepancy_independent_50.csv"));
     assert_eq!(table.header[0], "time_s");
-    assert_eq!(table.rows.len(), 101);
+    assert_eq!(table.rows.len(), 51);
 }

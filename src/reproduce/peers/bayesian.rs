@@ -273,7 +273,7 @@ impl CpuLogpFunc for Posterior {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::peers::tests::{exact_data, task};
+    use crate::reproduce::peers::tests::{exact_data, task};
 
     #[test]
     fn k_is_found() {

@@ -200,7 +200,7 @@ pub(super) fn scalar(tensor: &Tensor) -> Result<f64, PeerError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::peers::tests::{exact_data, task};
+    use crate::reproduce::peers::tests::{exact_data, task};
 
     const HIDDEN: usize = 3;
 

@@ -169,7 +169,7 @@ mod tests {
     use std::sync::atomic::{AtomicU64, Ordering};
 
     use super::*;
-    use crate::peers::tests::{exact_data, task};
+    use crate::reproduce::peers::tests::{exact_data, task};
 
     #[test]
     fn k_is_found() {
