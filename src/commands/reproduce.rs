@@ -62,17 +62,26 @@ impl Reproduce {
 
         let clock = Clock::start();
         let context = Context::new(self.quick, &workers, &progress);
-        let mut reports = Vec::new();
+        let (mut reports, mut failure) = (Vec::new(), None);
         for study in wanted {
             let started = clock.now();
-            reports.push(context.study(study).map_err(refused)?);
+            match context.study(study) {
+                Ok(report) => reports.push(report),
+                // What is done already is still worth reading.
+                Err(error) => {
+                    failure = Some(refused(error));
+                    break;
+                }
+            }
             let wall_s = s_from_ns(clock.now().ns_since(started));
             bar.suspend(|| say(format!("{:<22} {wall_s:>7.1} s   {}", study.name, study.about)));
             bar.inc(1);
         }
         bar.finish_and_clear();
-        let page = report::write(&self.output, HEADING, &reports).map_err(failed)?;
-        say(format!("{:.1} s in all; read {}", s_from_ns(clock.now().0), page.display()));
-        Ok(())
+        if !reports.is_empty() {
+            let page = report::write(&self.output, HEADING, &reports).map_err(failed)?;
+            say(format!("{:.1} s in all; read {}", s_from_ns(clock.now().0), page.display()));
+        }
+        failure.map_or(Ok(()), Err)
     }
 }

@@ -20,6 +20,8 @@ const INERTANCE_S: f64 = 10.0;
 #[derive(Debug, Clone, Copy)]
 struct Belief {
     what: Discrepancy,
+    /// Random walk between windows of `coupled`.
+    drift: f64,
     change: f64,
     magnitude: f64,
     initial_sd: f64,
@@ -36,6 +38,12 @@ impl Belief {
         };
         Self {
             what: Discrepancy { parameter, form },
+            drift: match settings.form {
+                DiscrepancyForm::Free => 0.0,
+                DiscrepancyForm::Tracked => change,
+                // An inductance, unless something else is asked for.
+                DiscrepancyForm::Inertial => settings.change.unwrap_or(0.0),
+            },
             change,
             magnitude: settings.magnitude.unwrap_or(of(MAGNITUDE)),
             initial_sd: settings.initial_sd.unwrap_or(initial_sd),
@@ -54,11 +62,6 @@ impl Belief {
             // `coupled` moves it between windows; in a window it does what its equation says.
             Form::Tracked | Form::Inertial { .. } => config.window.physics_weight,
         }
-    }
-
-    /// Random walk between windows.
-    fn drift(&self) -> f64 {
-        if self.what.form == Form::Free { 0.0 } else { self.change }
     }
 }
 
@@ -80,7 +83,8 @@ impl Config {
         self.discrepancy.iter().filter_map(belief).collect()
     }
 
-    /// What an estimator is told: a checked configuration gives settings that an estimator accepts.
+    /// What an estimator is told: a checked configuration gives settings that an estimator accepts, unless its random
+    /// features span nothing (biases of hundreds).
     ///
     /// # Errors
     /// When the initial pressures have no solution.
@@ -131,7 +135,7 @@ impl Config {
             },
             drift: Drift {
                 parameters: estimator.parameter_drift,
-                states: with(vec![estimator.pressure_drift; n], &Belief::drift),
+                states: with(vec![estimator.pressure_drift; n], &|belief| belief.drift),
                 inflation: estimator.inflation,
             },
             stopping: Stopping { max_iterations: estimator.max_iterations, tolerance_mmhg: estimator.tolerance },

@@ -20,6 +20,9 @@ use crate::xtfc::problem::{Datum, Prior, Solution, Unknowns, WindowProblem};
 /// A share of the prior variance that counts as learnt.
 const INFORMED: f64 = 1e-4;
 
+/// Draws of a member's features before they are given up.
+const MAX_REDRAWS: usize = 100;
+
 /// Runs a job for every member; the core does not know how. The job sees one member at a time and members do not see
 /// each other, so the order does not matter.
 pub trait Parallel: Sync {
@@ -572,14 +575,23 @@ fn draw_bases<M: Model>(
     let free = (0..model.n_states()).any(|state| model.is_free(state));
     let draws = (0..settings.members).map(|_| RandomFeatures::draw(settings.features, rng));
     let features = draws.collect::<Result<Vec<_>, _>>()?;
-    let slots: Vec<OnceLock<Result<Basis, FeatureError>>> = features.iter().map(|_| OnceLock::new()).collect();
+    let basis = |features: &RandomFeatures| {
+        let basis = Basis::new(features.clone(), length_s);
+        if free { basis.and_then(Basis::with_free) } else { basis }
+    };
+    let slots: Vec<OnceLock<Basis>> = features.iter().map(|_| OnceLock::new()).collect();
     parallel.for_indices(features.len(), &|i| {
-        let basis = Basis::new(features[i].clone(), length_s);
-        // Every index comes once, so that the slot is empty.
-        let _ = slots[i].set(if free { basis.and_then(Basis::with_free) } else { basis });
+        if let Ok(basis) = basis(&features[i]) {
+            // Every index comes once, so that the slot is empty.
+            let _ = slots[i].set(basis);
+        }
     });
-    // A slot that was never filled is a broken `Parallel`, and then there is no basis either.
-    slots.into_iter().map(|slot| Ok(slot.into_inner().unwrap_or(Err(FeatureError::Degenerate))?)).collect()
+    // Wide distributions now and then draw features that are all saturated: draw again, in the order of the members.
+    let mut again = || {
+        let mut draws = (0..MAX_REDRAWS).map(|_| basis(&RandomFeatures::draw(settings.features, rng)?));
+        draws.find(Result::is_ok).unwrap_or(Err(FeatureError::Degenerate))
+    };
+    slots.into_iter().map(|slot| Ok(slot.into_inner().map_or_else(&mut again, Ok)?)).collect()
 }
 
 /// `rows x columns` standard normals, row-major; every row is centred, its variance kept at 1.

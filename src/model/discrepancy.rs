@@ -106,11 +106,6 @@ impl<M: Model> Discrepant<M> {
         Ok(all)
     }
 
-    /// The model without discrepancies.
-    pub fn base(&self) -> &M {
-        &self.base
-    }
-
     /// Parameters that are functions of time, in the order of their states.
     pub fn discrepancies(&self) -> impl ExactSizeIterator<Item = usize> + '_ {
         self.terms.iter().map(|term| term.parameter)

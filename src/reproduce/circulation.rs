@@ -7,8 +7,8 @@ use crate::edge::synthetic::SyntheticPatient;
 use crate::model::Model;
 use crate::model::cvsim6::{Cvsim6, Pressures};
 
-/// Spacing of what is kept \[s\].
-const REPORT_EVERY_S: f64 = 0.005;
+/// Spacing of what is kept \[s\]; a multiple of the spacing of all records.
+const REPORT_EVERY_S: f64 = 0.006;
 
 /// What is observed and what is unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]

@@ -14,7 +14,7 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
         "Correlation over the members of the six pressures 5 ms after the start, late in the last diastole, and 0.15 s \
          into the last beat. Published: independent at first, strongly correlated later, with P_pa (and P_r in systole) \
          apart; uncorrelated in Sc6. Here one number, the volume of blood that a member started with, moves all pressures of \
-         `independent` together, and P_pa against the others late in diastole. In Sc6 the table of loose parameters in \
+         `independent` together, in Sc5 and Sc6 P_pa against the others late in diastole. In Sc6 the table of loose parameters in \
          `ablation` shows what loosens that.",
     );
     let names: Vec<String> = quantities().iter().take(6).map(|q| q.name.to_owned()).collect();

@@ -42,9 +42,7 @@ pub(super) struct Trace {
     pub members: Vec<Vec<f64>>,
     /// Per estimated parameter, the average of each member.
     pub averages: Vec<Vec<f64>>,
-    pub iterations: usize,
     pub not_converged: usize,
-    pub windows: usize,
 }
 
 impl Trace {
@@ -80,8 +78,6 @@ impl<M: Model> Experiment<'_, M> {
                 .map(|sample| Observation { s: s(sample.time_s), channel: sample.channel, value: sample.value })
                 .collect();
             let report = ensemble.step(&observations, parallel);
-            trace.windows += 1;
-            trace.iterations += report.iterations;
             trace.not_converged += report.not_converged;
 
             for &t in take(&mut reports, end, h, |t| *t) {

@@ -16,7 +16,8 @@ use crate::model::harmonic::{Harmonic, Parameter};
 use crate::xtfc::features::{Activation, FeatureSpec, Nodes, WeightDistribution};
 use crate::xtfc::problem::Stopping;
 
-/// Everything the harmonic studies choose. The defaults are the paper's where it says, and [`OPEN`] where not.
+/// Everything the harmonic studies choose. The defaults are the paper's where it
+/// says, and those of [`open_settings`] where not.
 #[derive(Debug, Clone)]
 pub(super) struct Setup {
     pub coupling: CouplingKind,
@@ -50,6 +51,8 @@ pub(super) const X0: f64 = 10.0;
 pub(super) const K: f64 = 1.0;
 /// Sd of the sensor.
 pub(super) const NOISE_SD: f64 = 0.2;
+/// Where k starts.
+pub(super) const K_GUESS: f64 = 1.2;
 /// Number of samples.
 pub(super) const SAMPLES: usize = 20;
 /// Seed of the one record that all harmonic studies with an unknown `k` share.
@@ -69,7 +72,7 @@ impl Setup {
             weights: WeightDistribution::Uniform { low: -1.0, high: 1.0 },
             physics_weight: 1.0,
             parameter_weight: if subdomains == 1 { 1e-3 } else { 1.0 },
-            k_guess: 1.2,
+            k_guess: K_GUESS,
             estimate_k: true,
             noise_sd: NOISE_SD,
             seed: 1,
@@ -164,7 +167,7 @@ pub(super) fn shared_record() -> Vec<Sample> {
     record(|t| Harmonic::default().exact(t, X0, K), SAMPLES, DATA_UNTIL_S, NOISE_SD, RECORD_SEED)
 }
 
-/// Mean and sd over the members of the estimated `k`, averaged over the windows with data.
+/// Mean and sd over the members of the estimated `k`, averaged over the windows of [`Experiment::average_s`].
 pub(super) fn k_of(trace: &Trace) -> (f64, f64) {
     mean_and_sd(&trace.averages[0])
 }
@@ -208,7 +211,11 @@ pub(super) fn open_settings(report: &mut Report) {
         "one noisy record; every member adds noise of the same sd to it",
         "the mean of k carries the error of that record, about one sd of k",
     ]);
-    table.row(["lambda_1, lambda_2", "1 and 1", "`harmonic-weights` sweeps lambda_1"]);
+    table.row([
+        "lambda_1, lambda_2".to_owned(),
+        format!("1 and 1 (`coupled`: {COUPLED_PHYSICS_WEIGHT} and 1/noise)"),
+        "`harmonic-weights` sweeps lambda_1".to_owned(),
+    ]);
     table.row([
         "collocation points, domain",
         "30 (B = 1) or 20 (B = 15), equally spaced; [-1, 1]",
@@ -216,10 +223,14 @@ pub(super) fn open_settings(report: &mut Report) {
     ]);
     table.row([
         "k between windows",
-        "B = 1: free; B = 15: tied to its last value by w_theta = 1; k averaged over the windows with data",
+        "B = 1: free; B = 15: tied to its last value by w_theta = 1; k averaged over the windows that end before t = 5",
         "w_theta trades the spread of k against the number of windows it takes to forget the guess",
     ]);
-    table.row(["start of k", "1.5", "not at all for B = 1; for B = 15 the first windows still carry it"]);
+    table.row([
+        "start of k".to_owned(),
+        K_GUESS.to_string(),
+        "not at all for B = 1; for B = 15 the first windows still carry it".to_owned(),
+    ]);
     report.table(table);
 }
 

@@ -31,8 +31,8 @@ const NOISELESS: &str = "Recovered: free and tracked delta are the flow that the
 const NOISY: &str = "Published: delta removes the bias of P_pa; the free one makes the flow negative, the inertial one does \
     not. The free one follows noise of some hundred mL/s from window to window; its spread is what the model-form column \
     shows. Tracked keeps the flow positive without an inductance; what it cannot follow within a beat stays outside its band, as \
-    members of `independent` know nothing of each other's misfit. `coupled` with it has the smallest error of P_pa, and \
-    the only band that holds the true flow.";
+    members of `independent` know nothing of each other's misfit. `coupled` with it has the smallest error of P_pa and \
+    holds the true flow in its band; that of the free one does so by being 150 mL/s wide on either side.";
 
 /// What the estimator believes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -226,3 +226,16 @@ fn explained_share_is_that_of_regression() {
     let matrix = correlation(&[a, b].concat(), 8);
     assert!((matrix[0] - 1.0).abs() < 1e-12 && matrix[1].abs() < 1e-12 && (matrix[3] - 1.0).abs() < 1e-12);
 }
+
+/// Wide distributions now and then draw a member whose features are all saturated.
+#[test]
+fn saturated_features_are_drawn_again() {
+    let config = with_set(&Config::default(), "window.biases={ normal = [0.0, 30.0] }");
+    let settings = config.estimator_settings().unwrap();
+    let ensemble = Ensemble::new(config.circulation().unwrap(), settings, 0.0, &Serial).unwrap();
+    assert_eq!(ensemble.len(), 100);
+    let hopeless = with_set(&Config::default(), "window.biases={ uniform = [100.0, 200.0] }");
+    let settings = hopeless.estimator_settings().unwrap();
+    let refused = Ensemble::new(hopeless.circulation().unwrap(), settings, 0.0, &Serial).map(|_| ()).unwrap_err();
+    assert!(refused.to_string().contains("span nothing"), "{refused}");
+}

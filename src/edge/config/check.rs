@@ -17,6 +17,9 @@ use crate::model::{Model, ParameterInfo};
 /// Pressures that a patient can start with \[mmHg\].
 const STARTING_MMHG: RangeInclusive<f64> = -50.0..=350.0;
 
+/// Shortest window \[s\]: event time counts nanoseconds.
+const SHORTEST_S: f64 = 1e-6;
+
 /// Largest seed: TOML has no larger integers.
 const MAX_SEED: u64 = i64::MAX as u64;
 
@@ -292,12 +295,13 @@ impl Checker {
     fn window(&mut self, window: &WindowSettings) {
         self.number("window.allowed_lateness_s", window.allowed_lateness_s, &positive_to(3600.0), " s");
         let (length_s, lateness_s) = (window.length_s, window.allowed_lateness_s);
-        if !positive_to(lateness_s).contains(&length_s) {
-            let expected = format!("more than 0 s and at most `window.allowed_lateness_s` ({lateness_s:?} s)");
+        if !(SHORTEST_S..=lateness_s).contains(&length_s) {
+            let expected =
+                format!("{SHORTEST_S:?} s or more and at most `window.allowed_lateness_s` ({lateness_s:?} s)");
             let message = format!("found {length_s:?}, expected {expected}");
             self.refuse_against("window.length_s", "window.allowed_lateness_s", message);
         }
-        self.number("window.forecast_limit_s", window.forecast_limit_s, &positive_to(86_400.0), " s");
+        self.number("window.forecast_limit_s", window.forecast_limit_s, &(SHORTEST_S..=86_400.0), " s");
         self.whole("window.collocation_points", window.collocation_points, 2..=64);
         self.whole("window.neurons", window.neurons, 1..=256);
         self.distribution("window.weights", window.weights);
@@ -305,7 +309,7 @@ impl Checker {
         self.interval("window.domain", window.domain);
         self.number("window.physics_weight", window.physics_weight, &positive_to(1e9), "");
         self.number("window.data_weight", window.data_weight, &positive_to(1e9), "");
-        self.number("window.parameter_weight", window.parameter_weight, &(0.0..=1e9), "");
+        self.number("window.parameter_weight", window.parameter_weight, &positive_to(1e9), "");
     }
 
     fn distribution(&mut self, key: &str, distribution: Distribution) {

@@ -187,7 +187,7 @@ pub enum Nodes {
     Uniform,
     /// Chebyshev-Gauss-Lobatto.
     Chebyshev,
-    /// Legendre-Gauss-Lobatto.
+    /// Gauss-Legendre, all inside.
     Legendre,
 }
 
