@@ -1,6 +1,5 @@
 //! `hemostream estimate`: the estimator over a file.
 
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -14,9 +13,9 @@ use hemostream::model::cvsim6::Pressures;
 use hemostream::model::discrepancy::Circulation;
 use hemostream::runtime::clock::Clock;
 use hemostream::runtime::workers::Workers;
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 
-use super::{ConfigArgs, Failure, failed, say};
+use super::{ConfigArgs, Failure, failed, progress_bar, say};
 
 /// Run the estimator over a record, as fast as the machine goes
 #[derive(Args)]
@@ -100,10 +99,7 @@ impl Run {
             let expected = config.observed.join(", ");
             return Err(Failure::Input(format!("no column of the record is observed, expected one of {expected}")));
         }
-        let progress =
-            if std::io::stderr().is_terminal() { ProgressBar::new(whole(seconds)) } else { ProgressBar::hidden() };
-        let style = ProgressStyle::with_template("{bar:40} {pos}/{len} s  {eta} left");
-        progress.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+        let progress = progress_bar(whole(seconds), "{bar:40} {pos}/{len} s  {eta} left");
         Ok(Self {
             table: TableWriter::create(output, &estimate_header(&model, estimator.estimated()))?,
             estimator,

@@ -9,7 +9,7 @@ mod serve;
 mod simulate;
 mod watch;
 
-use std::io::Write;
+use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -18,6 +18,7 @@ use hemostream::edge::bus::BusError;
 use hemostream::edge::config::{Config, ConfigError, Origins};
 use hemostream::edge::files::csv::CsvError;
 use hemostream::edge::replay::ReplayError;
+use indicatif::{ProgressBar, ProgressStyle};
 
 /// Live hemodynamics with honest uncertainty.
 ///
@@ -105,6 +106,14 @@ pub(crate) fn say(line: impl AsRef<str>) {
     if writeln!(std::io::stdout().lock(), "{}", line.as_ref()).is_err() {
         std::process::exit(0);
     }
+}
+
+/// A bar on a terminal, nothing elsewhere.
+pub(crate) fn progress_bar(length: u64, template: &str) -> ProgressBar {
+    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(length) } else { ProgressBar::hidden() };
+    let style = ProgressStyle::with_template(template);
+    bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+    bar
 }
 
 fn log_to_stderr() {

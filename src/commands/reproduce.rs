@@ -1,6 +1,5 @@
 //! `hemostream reproduce`: the paper's examples, tables and figures.
 
-use std::io::IsTerminal;
 use std::path::PathBuf;
 
 use clap::Args;
@@ -9,9 +8,8 @@ use hemostream::estimate::time::s_from_ns;
 use hemostream::reproduce::{Context, HEADING, STUDIES, StudyError, report};
 use hemostream::runtime::clock::Clock;
 use hemostream::runtime::workers::Workers;
-use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{Failure, failed, say};
+use super::{Failure, failed, progress_bar, say};
 
 /// The name that stands for all studies.
 const ALL: &str = "all";
@@ -53,10 +51,7 @@ impl Reproduce {
         let workers = Workers::start(self.threads).map_err(failed)?;
         let wanted: Vec<_> =
             STUDIES.iter().filter(|study| self.what == study.name || (self.what == ALL && study.is_built())).collect();
-        let bar =
-            if std::io::stderr().is_terminal() { ProgressBar::new(wanted.len() as u64) } else { ProgressBar::hidden() };
-        let style = ProgressStyle::with_template("{bar:30} {pos}/{len} {elapsed} {msg}");
-        bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
+        let bar = progress_bar(wanted.len() as u64, "{bar:30} {pos}/{len} {elapsed} {msg}");
         bar.enable_steady_tick(std::time::Duration::from_millis(200));
         let progress = |what: &str| bar.set_message(what.to_owned());
 

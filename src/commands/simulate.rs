@@ -50,8 +50,7 @@ impl Simulate {
         let (config, _) = self.config.load()?;
         let mut patient = SyntheticPatient::new(&config, self.seed.unwrap_or(config.estimator.seed))?;
         let changing = patient.changing().to_vec();
-        let observed: Vec<usize> =
-            (0..Pressures::LEN).filter(|&i| config.observed.iter().any(|o| o == Pressures::NAMES[i])).collect();
+        let observed = config.observed_states();
         let mut header = vec!["time_s".to_owned()];
         header.extend(observed.iter().map(|&i| Pressures::NAMES[i].to_owned()));
         let create = |path: &PathBuf, header: &[String]| TableWriter::create(path, header);

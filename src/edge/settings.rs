@@ -4,7 +4,7 @@ use super::config::{self, Config, ConfigError, DiscrepancyForm, DiscrepancySetti
 use crate::estimate::settings::{ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings};
 use crate::estimate::time::ns_from_s;
 use crate::model::Model;
-use crate::model::cvsim6::{Cvsim6, Pressures};
+use crate::model::cvsim6::Pressures;
 use crate::model::discrepancy::{Circulation, Discrepancy, Discrepant, Form};
 use crate::xtfc::features::{Activation, FeatureSpec, Nodes, WeightDistribution};
 use crate::xtfc::problem::Stopping;
@@ -139,19 +139,23 @@ impl Config {
                 inflation: estimator.inflation,
             },
             stopping: Stopping { max_iterations: estimator.max_iterations, tolerance_mmhg: estimator.tolerance },
-            channels: self.observed_channels(model),
+            channels: self.observed_channels(),
             aleatoric_sd_mmhg: with(self.channels.iter().map(|(_, c)| c.noise_sd).collect(), &|_| 0.0),
             publish_period_ns: ns_from_s(1.0 / self.publish.rate_hz),
         })
     }
 
-    /// The observed channels, in the order of the states.
-    fn observed_channels(&self, model: Cvsim6) -> Vec<ChannelSettings> {
-        let observed = |name: &str| self.observed.iter().any(|o| o == name);
-        let states = model.states().iter().enumerate().filter(|(_, q)| observed(q.name));
+    /// The observed states: one channel each, in this order.
+    #[must_use]
+    pub fn observed_states(&self) -> Vec<usize> {
+        (0..Pressures::LEN).filter(|&i| self.observed.iter().any(|o| o == Pressures::NAMES[i])).collect()
+    }
+
+    fn observed_channels(&self) -> Vec<ChannelSettings> {
+        let states = self.observed_states().into_iter();
         states
-            .filter_map(|(state, q)| {
-                self.channels.get(q.name).map(|c| ChannelSettings {
+            .filter_map(|state| {
+                self.channels.get(Pressures::NAMES[state]).map(|c| ChannelSettings {
                     state,
                     noise_sd_mmhg: c.noise_sd,
                     plausible_mmhg: (c.min_mmhg, c.max_mmhg),

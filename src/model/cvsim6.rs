@@ -257,13 +257,11 @@ const fn resistance(name: &'static str, ba_s_per_ml: f64) -> ParameterInfo {
 }
 
 const fn missing_flow(name: &'static str) -> ParameterInfo {
-    let transform = Transform::Linear { scale: 10.0 };
-    ParameterInfo { name, unit: "mL/s", default: 0.0, bounds: (-1e4, 1e4), transform, estimable: true }
+    ParameterInfo::missing(name, "mL/s", 10.0, 1e4)
 }
 
 const fn missing_rate(name: &'static str) -> ParameterInfo {
-    let transform = Transform::Linear { scale: 1.0 };
-    ParameterInfo { name, unit: "mmHg/s", default: 0.0, bounds: (-1e5, 1e5), transform, estimable: true }
+    ParameterInfo::missing(name, "mmHg/s", 1.0, 1e5)
 }
 
 const fn fixed_volume(name: &'static str, default: f64) -> ParameterInfo {

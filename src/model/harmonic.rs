@@ -42,14 +42,7 @@ const PARAMETERS: &[ParameterInfo] = &[
         transform: Transform::Log,
         estimable: true,
     },
-    ParameterInfo {
-        name: "delta",
-        unit: "1/s",
-        default: 0.0,
-        bounds: (-1e6, 1e6),
-        transform: Transform::Linear { scale: 1.0 },
-        estimable: true,
-    },
+    ParameterInfo::missing("delta", "1/s", 1.0, 1e6),
     ParameterInfo {
         name: "time",
         unit: "s",
@@ -106,10 +99,6 @@ impl Model for Harmonic {
         PARAMETERS
     }
 
-    fn derived(&self) -> &[Quantity] {
-        &[]
-    }
-
     fn rhs(&self, t_s: f64, x: &[f64], theta: &[f64], dx: &mut [f64]) {
         let Parameters { k, delta, time } = Parameters::from_slice(theta);
         dx[0] = self.amplitude(x[0]).0 * (k * (time + t_s)).cos() / k + delta;
@@ -138,13 +127,7 @@ impl Model for Harmonic {
         }
     }
 
-    fn derive(&self, _: f64, _: &[f64], _: &[f64], _: &mut [f64]) {}
-
     fn advance(&self, dt_s: f64, theta: &mut [f64]) {
         theta[Parameter::Time as usize] += dt_s;
-    }
-
-    fn next_corner(&self, _: f64, _: f64, _: &[f64]) -> Option<f64> {
-        None
     }
 }

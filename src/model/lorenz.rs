@@ -16,7 +16,7 @@
 //!
 //! Lorenz, *Deterministic nonperiodic flow*, J. Atmos. Sci. 20 (1963). Everything is dimensionless.
 
-use super::{Model, ParameterInfo, Quantity, Transform};
+use super::{Model, ParameterInfo, Quantity};
 use crate::named_vector;
 
 named_vector! {
@@ -43,22 +43,13 @@ const STATES: &[Quantity] =
     &[Quantity { name: "x", unit: "1" }, Quantity { name: "y", unit: "1" }, Quantity { name: "z", unit: "1" }];
 
 const PARAMETERS: &[ParameterInfo] = &[
-    positive("sigma", 10.0),
-    positive("rho", 28.0),
-    positive("beta", 8.0 / 3.0),
-    missing("delta_x"),
-    missing("delta_y"),
-    missing("delta_z"),
+    ParameterInfo::positive("sigma", "1", 10.0),
+    ParameterInfo::positive("rho", "1", 28.0),
+    ParameterInfo::positive("beta", "1", 8.0 / 3.0),
+    ParameterInfo::missing("delta_x", "1", 1.0, 1e6),
+    ParameterInfo::missing("delta_y", "1", 1.0, 1e6),
+    ParameterInfo::missing("delta_z", "1", 1.0, 1e6),
 ];
-
-const fn positive(name: &'static str, default: f64) -> ParameterInfo {
-    ParameterInfo { name, unit: "1", default, bounds: (1e-6, 1e6), transform: Transform::Log, estimable: true }
-}
-
-const fn missing(name: &'static str) -> ParameterInfo {
-    let transform = Transform::Linear { scale: 1.0 };
-    ParameterInfo { name, unit: "1", default: 0.0, bounds: (-1e6, 1e6), transform, estimable: true }
-}
 
 /// How much of the equations is known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -97,10 +88,6 @@ impl Model for Lorenz {
 
     fn parameters(&self) -> &[ParameterInfo] {
         PARAMETERS
-    }
-
-    fn derived(&self) -> &[Quantity] {
-        &[]
     }
 
     fn rhs(&self, _: f64, x: &[f64], theta: &[f64], dx: &mut [f64]) {
@@ -149,13 +136,5 @@ impl Model for Lorenz {
             };
             rows.iter().enumerate().for_each(|(i, value)| dfdtheta[i * which.len() + column] = *value);
         }
-    }
-
-    fn derive(&self, _: f64, _: &[f64], _: &[f64], _: &mut [f64]) {}
-
-    fn advance(&self, _: f64, _: &mut [f64]) {}
-
-    fn next_corner(&self, _: f64, _: f64, _: &[f64]) -> Option<f64> {
-        None
     }
 }

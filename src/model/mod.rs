@@ -136,6 +136,21 @@ pub struct ParameterInfo {
     pub estimable: bool,
 }
 
+impl ParameterInfo {
+    /// A positive number of which nothing more is known, estimated by its logarithm.
+    #[must_use]
+    pub const fn positive(name: &'static str, unit: &'static str, default: f64) -> Self {
+        Self { name, unit, default, bounds: (1e-6, 1e6), transform: Transform::Log, estimable: true }
+    }
+
+    /// What an equation lacks: 0 unless something is, typically of size `scale`, up to `limit` either way.
+    #[must_use]
+    pub const fn missing(name: &'static str, unit: &'static str, scale: f64, limit: f64) -> Self {
+        let transform = Transform::Linear { scale };
+        Self { name, unit, default: 0.0, bounds: (-limit, limit), transform, estimable: true }
+    }
+}
+
 /// A vessel along which a pressure difference accelerates blood.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct InductancePath {
@@ -159,8 +174,10 @@ pub trait Model: Clone + Send + Sync + 'static {
     /// The parameters, in order.
     fn parameters(&self) -> &[ParameterInfo];
 
-    /// Quantities that follow from states and parameters, in order.
-    fn derived(&self) -> &[Quantity];
+    /// Quantities that follow from states and parameters, in order; none unless said otherwise.
+    fn derived(&self) -> &[Quantity] {
+        &[]
+    }
 
     /// `dx = f(t, x, theta)`; `x`, `dx`: `[n_states]`, `theta`: `[n_parameters]`.
     fn rhs(&self, t_s: f64, x: &[f64], theta: &[f64], dx: &mut [f64]);
@@ -174,15 +191,22 @@ pub trait Model: Clone + Send + Sync + 'static {
     fn parameter_jacobian(&self, t_s: f64, x: &[f64], theta: &[f64], which: &[usize], dfdtheta: &mut [f64]);
 
     /// Derived quantities; `out`: `[n_derived]`.
-    fn derive(&self, t_s: f64, x: &[f64], theta: &[f64], out: &mut [f64]);
+    fn derive(&self, t_s: f64, x: &[f64], theta: &[f64], out: &mut [f64]) {
+        let _ = (t_s, x, theta, out);
+    }
 
-    /// Moves the clock parameters on by `dt_s`.
-    fn advance(&self, dt_s: f64, theta: &mut [f64]);
+    /// Moves the clock parameters on by `dt_s`; none unless said otherwise.
+    fn advance(&self, dt_s: f64, theta: &mut [f64]) {
+        let _ = (dt_s, theta);
+    }
 
     /// The first time in `(t_s, until_s)` at which `f` is not smooth in `t`, if any.
     ///
     /// Integrators restart there. Kinks that depend on the state (valves) are not reported.
-    fn next_corner(&self, t_s: f64, until_s: f64, theta: &[f64]) -> Option<f64>;
+    fn next_corner(&self, t_s: f64, until_s: f64, theta: &[f64]) -> Option<f64> {
+        let _ = (t_s, until_s, theta);
+        None
+    }
 
     /// Whether a state is a function of time of which nothing is known: no equation, no continuity. `f` is then not
     /// its derivative but its value, as far as anything is believed of it.

@@ -12,7 +12,7 @@
 //! | `zeta` | 0.1 | 1 | damping ratio |
 //! | `delta_x`, `delta_y` | 0 | 1/s, 1/s^2 | what the right-hand sides lack |
 
-use super::{Model, ParameterInfo, Quantity, Transform};
+use super::{Model, ParameterInfo, Quantity};
 use crate::named_vector;
 
 named_vector! {
@@ -34,20 +34,11 @@ named_vector! {
 const STATES: &[Quantity] = &[Quantity { name: "x", unit: "1" }, Quantity { name: "y", unit: "1/s" }];
 
 const PARAMETERS: &[ParameterInfo] = &[
-    positive("omega", "1/s", 2.0),
-    positive("zeta", "1", 0.1),
-    missing("delta_x", "1/s"),
-    missing("delta_y", "1/s^2"),
+    ParameterInfo::positive("omega", "1/s", 2.0),
+    ParameterInfo::positive("zeta", "1", 0.1),
+    ParameterInfo::missing("delta_x", "1/s", 1.0, 1e6),
+    ParameterInfo::missing("delta_y", "1/s^2", 1.0, 1e6),
 ];
-
-const fn positive(name: &'static str, unit: &'static str, default: f64) -> ParameterInfo {
-    ParameterInfo { name, unit, default, bounds: (1e-6, 1e6), transform: Transform::Log, estimable: true }
-}
-
-const fn missing(name: &'static str, unit: &'static str) -> ParameterInfo {
-    let transform = Transform::Linear { scale: 1.0 };
-    ParameterInfo { name, unit, default: 0.0, bounds: (-1e6, 1e6), transform, estimable: true }
-}
 
 /// How much of the equations is known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -73,10 +64,6 @@ impl Model for Oscillator {
 
     fn parameters(&self) -> &[ParameterInfo] {
         PARAMETERS
-    }
-
-    fn derived(&self) -> &[Quantity] {
-        &[]
     }
 
     fn rhs(&self, _: f64, x: &[f64], theta: &[f64], dx: &mut [f64]) {
@@ -113,13 +100,5 @@ impl Model for Oscillator {
             };
             (dfdtheta[column], dfdtheta[which.len() + column]) = (by_x, by_y);
         }
-    }
-
-    fn derive(&self, _: f64, _: &[f64], _: &[f64], _: &mut [f64]) {}
-
-    fn advance(&self, _: f64, _: &mut [f64]) {}
-
-    fn next_corner(&self, _: f64, _: f64, _: &[f64]) -> Option<f64> {
-        None
     }
 }

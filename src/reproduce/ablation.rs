@@ -186,9 +186,14 @@ fn error(run: &CaseRun, q: usize) -> f64 {
 /// Estimate over truth of an unknown parameter: mean and sd of the members' averages.
 fn relative(run: &CaseRun, k: usize) -> (&str, f64, f64) {
     let name = run.config.estimator.estimate[k].as_str();
-    let truth = run.config.patient.model().parameter_index(name).map_or(f64::NAN, |p| run.config.patient.theta()[p]);
+    let truth = truth(run, name);
     let (mean, sd) = mean_and_sd(&run.trace.averages[k]);
     (name, mean / truth, sd / truth)
+}
+
+/// The true value of a parameter.
+fn truth(run: &CaseRun, name: &str) -> f64 {
+    run.config.patient.model().parameter_index(name).map_or(f64::NAN, |p| run.config.patient.theta()[p])
 }
 
 fn write_figures(report: &mut Report, case: Case, run: &CaseRun) {
@@ -308,8 +313,7 @@ fn pictures(report: &mut Report, runs: &[(Case, std::rc::Rc<CaseRun>)]) {
         let mut chart = Chart::new(case.name(), "t [s]", "estimate / truth").y_range(0.8, 1.6);
         for (k, colour) in (0..run.config.estimator.estimate.len()).zip([Colour::Blue, Colour::Orange]) {
             let name = run.config.estimator.estimate[k].clone();
-            let p = run.config.patient.model().parameter_index(&name);
-            let truth = p.map_or(f64::NAN, |p| run.config.patient.theta()[p]);
+            let truth = truth(run, &name);
             let band = run.trace.parameter(k).map(|(t, s)| (t, s.q05 / truth, s.q95 / truth)).collect();
             let line = run.trace.parameter(k).map(|(t, s)| (t, s.mean / truth)).collect();
             chart = chart.band("", band, colour).line(&name, line, colour);

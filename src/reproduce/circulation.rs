@@ -5,7 +5,7 @@ use super::{Context, StudyError, timed};
 use crate::edge::config::{Config, Coupling, InitialSd, PerState};
 use crate::edge::synthetic::SyntheticPatient;
 use crate::model::Model;
-use crate::model::cvsim6::{Cvsim6, Pressures};
+use crate::model::cvsim6::Cvsim6;
 
 /// Spacing of what is kept \[s\]; a multiple of the spacing of all records.
 const REPORT_EVERY_S: f64 = 0.006;
@@ -116,8 +116,7 @@ pub(super) struct Record {
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 pub(super) fn record(config: &Config, until_s: f64, rate_hz: f64, noise: f64, seed: u64) -> Result<Record, StudyError> {
     let mut patient = SyntheticPatient::new(config, seed)?;
-    let states: Vec<usize> =
-        (0..Pressures::LEN).filter(|&i| config.observed.iter().any(|o| o == Pressures::NAMES[i])).collect();
+    let states = config.observed_states();
     let mut all = Record { samples: Vec::new(), times_s: Vec::new(), truth: Vec::new() };
     let every = (rate_hz * REPORT_EVERY_S).round().max(1.0) as usize;
     for i in 1..=(until_s * rate_hz).round() as usize {
@@ -207,7 +206,11 @@ impl CaseRun {
 
     /// Positions in the trace of the last two beats.
     pub(super) fn last_beats(&self) -> impl Iterator<Item = usize> + '_ {
-        let (from, to) = self.last_beats_s;
+        self.within(self.last_beats_s.0, self.last_beats_s.1)
+    }
+
+    /// Positions in the trace of the times in `(from, to]` \[s\].
+    pub(super) fn within(&self, from: f64, to: f64) -> impl Iterator<Item = usize> + '_ {
         self.trace.times_s.iter().enumerate().filter(move |(_, t)| **t > from && **t <= to + 1e-9).map(|(i, _)| i)
     }
 }

@@ -6,6 +6,9 @@ use super::report::{Report, Table, mean, short};
 use super::{Context, StudyError};
 use crate::estimate::statistics::Summary;
 
+/// What is shown, in the order of the model.
+const SHOWN: [&str; 4] = ["p_l", "p_a", "q_li", "q_lo"];
+
 pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
     let mut report = Report::new("decomposition", "Uncertainty by source over a beat");
     report.text(
@@ -28,11 +31,11 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
         let (start, end) = last_beat(&run);
         let mut rows: Vec<Vec<f64>> = Vec::new();
         for (q, quantity) in quantities().iter().enumerate() {
-            if !["p_a", "p_l", "q_li", "q_lo"].contains(&quantity.name) {
+            if !SHOWN.contains(&quantity.name) {
                 continue;
             }
             let at = |of: fn(&Summary) -> f64| -> Vec<(f64, f64)> {
-                within(&run, start, end)
+                run.within(start, end)
                     .map(|i| (run.trace.times_s[i] - start, of(&run.trace.quantities[i][q])))
                     .collect()
             };
@@ -42,7 +45,7 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
                 .line("aleatoric", at(|s| s.aleatoric_sd), Colour::Blue);
             figure = figure.panel(chart);
             let phase = |from: f64, to: f64, of: fn(&Summary) -> f64| {
-                mean(within(&run, start + from, start + to).map(|i| of(&run.trace.quantities[i][q])))
+                mean(run.within(start + from, start + to).map(|i| of(&run.trace.quantities[i][q])))
             };
             let sources: [fn(&Summary) -> f64; 3] = [|s| s.epistemic_sd, |s| s.aleatoric_sd, |s| s.sd];
             let mut cells = vec![case.name(), quantity.name.to_owned()];
@@ -54,16 +57,15 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
                 }
             }
             table.row(cells);
-            let columns = within(&run, start, end).map(|i| sources.map(|of| of(&run.trace.quantities[i][q])));
+            let columns = run.within(start, end).map(|i| sources.map(|of| of(&run.trace.quantities[i][q])));
             if rows.is_empty() {
-                rows = within(&run, start, end).map(|i| vec![run.trace.times_s[i] - start]).collect();
+                rows = run.within(start, end).map(|i| vec![run.trace.times_s[i] - start]).collect();
             }
             rows.iter_mut().zip(columns).for_each(|(row, sds)| row.extend(sds));
         }
-        let names = ["p_l", "p_a", "q_li", "q_lo"];
         let header = ["time_s".to_owned()]
             .into_iter()
-            .chain(names.iter().flat_map(|n| ["epistemic_sd", "aleatoric_sd", "total_sd"].map(|s| format!("{n}_{s}"))));
+            .chain(SHOWN.iter().flat_map(|n| ["epistemic_sd", "aleatoric_sd", "total_sd"].map(|s| format!("{n}_{s}"))));
         report.series(&format!("decomposition_{}", case.key()), header, rows);
         report.picture(&format!("decomposition_{}", case.key()), figure, format!("By source, {}.", case.name()));
     }
@@ -75,9 +77,4 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
 fn last_beat(run: &CaseRun) -> (f64, f64) {
     let (from, to) = run.last_beats_s;
     (0.5 * (from + to), to)
-}
-
-fn within(run: &CaseRun, from: f64, to: f64) -> impl Iterator<Item = usize> + '_ {
-    let times = run.trace.times_s.iter().enumerate();
-    times.filter(move |(_, t)| **t > from && **t <= to + 1e-9).map(|(i, _)| i)
 }

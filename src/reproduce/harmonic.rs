@@ -6,10 +6,10 @@ use rand_distr::{Distribution, StandardNormal, Uniform};
 
 use super::experiment::{Experiment, Sample, Trace};
 use super::plot::{Chart, Colour, Figure};
-use super::report::{Report, Table, plus_minus, short};
+use super::report::{Report, Table, mean, plus_minus, rms, short};
 use super::{Context, StudyError, timed};
 use crate::estimate::settings::{ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings};
-use crate::estimate::statistics::mean_and_sd;
+use crate::estimate::statistics::{Summary, mean_and_sd};
 use crate::estimate::time::ns_from_s;
 use crate::model::Model;
 use crate::model::harmonic::{Harmonic, Parameter};
@@ -173,29 +173,37 @@ pub(super) fn k_of(trace: &Trace) -> (f64, f64) {
 }
 
 /// Mean over `(from, to]` of the error of the mean and of the epistemic sd.
-#[allow(clippy::cast_precision_loss)]
 pub(super) fn error_and_band(trace: &Trace, exact: impl Fn(f64) -> f64, from: f64, to: f64) -> (f64, f64) {
-    let rows: Vec<(f64, f64)> = trace
-        .quantity(0)
-        .filter(|(t, _)| *t > from && *t <= to)
-        .map(|(t, s)| ((s.mean - exact(t)).powi(2), s.epistemic_sd))
-        .collect();
-    let n = rows.len() as f64;
-    ((rows.iter().map(|r| r.0).sum::<f64>() / n).sqrt(), rows.iter().map(|r| r.1).sum::<f64>() / n)
+    let within = || trace.quantity(0).filter(|(t, _)| *t > from && *t <= to);
+    (rms(within().map(|(t, s)| s.mean - exact(t))), mean(within().map(|(_, s)| s.epistemic_sd)))
 }
 
-/// Curve with bands, data and truth.
-pub(super) fn chart(title: &str, trace: &Trace, samples: &[Sample], exact: impl Fn(f64) -> f64) -> Chart {
-    let band = |half: &dyn Fn(&crate::estimate::statistics::Summary) -> f64| -> Vec<(f64, f64, f64)> {
-        trace.quantity(0).map(|(t, s)| (t, s.mean - 2.0 * half(s), s.mean + 2.0 * half(s))).collect()
+/// Mean, total band, the band of one source, and truth of one quantity.
+pub(super) fn curve(
+    (title, y): (&str, &str),
+    (trace, q): (&Trace, usize),
+    (source, sd): (&str, fn(&Summary) -> f64),
+    exact: impl Fn(f64) -> f64,
+) -> Chart {
+    let edges = |half: fn(&Summary) -> f64| -> Vec<(f64, f64, f64)> {
+        trace.quantity(q).map(|(t, s)| (t, s.mean - 2.0 * half(s), s.mean + 2.0 * half(s))).collect()
     };
-    Chart::new(title, "t [s]", "x")
-        .region("no data", DATA_UNTIL_S, HORIZON_S)
-        .band("total, 2 sd", band(&|s| s.sd), Colour::SkyBlue)
-        .band("epistemic, 2 sd", band(&|s| s.epistemic_sd), Colour::Orange)
-        .line("mean", trace.quantity(0).map(|(t, s)| (t, s.mean)).collect(), Colour::Blue)
+    Chart::new(title, "t [s]", y)
+        .band("total, 2 sd", edges(|s| s.sd), Colour::SkyBlue)
+        .band(&format!("{source}, 2 sd"), edges(sd), Colour::Orange)
+        .line("mean", trace.quantity(q).map(|(t, s)| (t, s.mean)).collect(), Colour::Blue)
         .dashed("exact", trace.times_s.iter().map(|&t| (t, exact(t))).collect(), Colour::Black)
-        .points("data", samples.iter().map(|s| (s.time_s, s.value)).collect(), Colour::Vermilion)
+}
+
+/// The same with the data of a record.
+pub(super) fn with_data(chart: Chart, samples: &[Sample]) -> Chart {
+    chart.points("data", samples.iter().map(|s| (s.time_s, s.value)).collect(), Colour::Vermilion)
+}
+
+/// Curve with bands, data in the first half, and truth.
+pub(super) fn chart(title: &str, trace: &Trace, samples: &[Sample], exact: impl Fn(f64) -> f64) -> Chart {
+    let curve = curve((title, "x"), (trace, 0), ("epistemic", |s| s.epistemic_sd), exact);
+    with_data(curve.region("no data", DATA_UNTIL_S, HORIZON_S), samples)
 }
 
 /// The settings that the paper leaves open, for the report.

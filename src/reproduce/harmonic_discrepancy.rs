@@ -1,8 +1,8 @@
 //! `harmonic-discrepancy`: the truth grows, the model does not, and a network stands for what it lacks.
 
 use super::experiment::{Experiment, Sample, Trace};
-use super::harmonic::{HORIZON_S, K, Setup, X0, grid, record};
-use super::plot::{Chart, Colour, Figure, Panel};
+use super::harmonic::{HORIZON_S, K, Setup, X0, curve, grid, record, with_data};
+use super::plot::{Figure, Panel};
 use super::report::{Report, Table, mean, rms, short};
 use super::{Context, StudyError};
 use crate::estimate::settings::{CouplingKind, EstimatorSettings};
@@ -14,6 +14,8 @@ use crate::model::harmonic::{Harmonic, Law, Parameter};
 const NOISE_SD: f64 = 0.2;
 /// Records that the errors are averaged over.
 const RECORDS: u64 = 5;
+/// The source of uncertainty that the pictures show.
+const MODEL: (&str, fn(&Summary) -> f64) = ("model form", |s| s.model_sd);
 /// What is believed of delta: hardly anything.
 const DELTA_WEIGHT: f64 = 1e-3;
 
@@ -57,12 +59,10 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
             report.figure(&format!("{path}.delta_model_sd"), sd);
             table.row([size.to_string(), key.to_owned(), short(x_error), short(delta_error), short(sd)]);
             if key == "independent" {
-                figure = figure.panel(curve(&format!("{size} samples"), "x", &trace, 0, exact).points(
-                    "data",
-                    samples.iter().map(|s| (s.time_s, s.value)).collect(),
-                    Colour::Vermilion,
-                ));
-                deltas.push(curve(&format!("{size} samples"), "delta", &trace, 1, exact_delta).into());
+                let title = format!("{size} samples");
+                let x = curve((&title, "x"), (&trace, 0), MODEL, exact);
+                figure = figure.panel(with_data(x, &samples));
+                deltas.push(curve((&title, "delta"), (&trace, 1), MODEL, exact_delta).into());
             }
             let rows = trace.times_s.iter().zip(&trace.quantities);
             let rows =
@@ -85,14 +85,10 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
         figure,
         "Above x, below delta, for three data sizes. Published: delta is recovered, the better the more data.",
     );
-    let alone = curve("50 samples, without delta", "x", &without, 0, exact).points(
-        "data",
-        samples.iter().map(|s| (s.time_s, s.value)).collect(),
-        Colour::Vermilion,
-    );
+    let alone = curve(("50 samples, without delta", "x"), (&without, 0), MODEL, exact);
     report.picture(
         "harmonic_discrepancy_without",
-        Figure::new("The wrong model alone", 1).panel(alone),
+        Figure::new("The wrong model alone", 1).panel(with_data(alone, &samples)),
         "Without delta the estimate is wrong by far more than its band.",
     );
     Ok(report)
@@ -123,16 +119,4 @@ fn experiment<'a, M>(model: M, settings: EstimatorSettings, samples: &'a [Sample
         members_at_s: &[],
         average_s: (0.0, 0.0),
     }
-}
-
-/// Mean, bands and truth of one quantity.
-fn curve(title: &str, y: &str, trace: &Trace, q: usize, exact: impl Fn(f64) -> f64) -> Chart {
-    let edges = |half: fn(&Summary) -> f64| -> Vec<(f64, f64, f64)> {
-        trace.quantity(q).map(|(t, s)| (t, s.mean - 2.0 * half(s), s.mean + 2.0 * half(s))).collect()
-    };
-    Chart::new(title, "t [s]", y)
-        .band("total, 2 sd", edges(|s| s.sd), Colour::SkyBlue)
-        .band("model form, 2 sd", edges(|s| s.model_sd), Colour::Orange)
-        .line("mean", trace.quantity(q).map(|(t, s)| (t, s.mean)).collect(), Colour::Blue)
-        .dashed("exact", trace.times_s.iter().map(|&t| (t, exact(t))).collect(), Colour::Black)
 }
