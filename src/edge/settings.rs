@@ -1,11 +1,13 @@
 //! From the configuration to what the core wants to know.
 
 use super::config::{self, Config, ConfigError, DiscrepancyForm, DiscrepancySettings};
-use crate::estimate::settings::{ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings};
+use crate::estimate::settings::{
+    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
+};
 use crate::estimate::time::ns_from_s;
-use crate::model::Model;
-use crate::model::cvsim6::Pressures;
+use crate::model::cvsim6::{PARAMETERS, Pressures};
 use crate::model::discrepancy::{Circulation, Discrepancy, Discrepant, Form};
+use crate::model::{Model, ParameterInfo};
 use crate::xtfc::features::{Activation, FeatureSpec, Nodes, WeightDistribution};
 use crate::xtfc::problem::Stopping;
 
@@ -13,12 +15,15 @@ use crate::xtfc::problem::Stopping;
 const MAGNITUDE: (f64, f64) = (300.0, 100.0);
 /// The same per square root of a second.
 const CHANGE: (f64, f64) = (100.0, 20.0);
+/// Spread at the start and drift of the heart rate (relative) and of the phase of the beat (beats).
+const HEART_RATE: (f64, f64) = (0.05, 0.01);
+const BEAT_PHASE: (f64, f64) = (0.03, 0.005);
 /// The paper's `L = 10 R` \[s\].
 const INERTANCE_S: f64 = 10.0;
 
 /// A discrepancy with everything filled in.
 #[derive(Debug, Clone, Copy)]
-struct Belief {
+struct Lack {
     what: Discrepancy,
     /// Random walk between windows of `coupled`.
     drift: f64,
@@ -27,7 +32,7 @@ struct Belief {
     initial_sd: f64,
 }
 
-impl Belief {
+impl Lack {
     fn new(name: &str, settings: &DiscrepancySettings, parameter: usize) -> Self {
         let of = |(flow, balance): (f64, f64)| if name.starts_with('q') { flow } else { balance };
         let change = settings.change.unwrap_or(of(CHANGE));
@@ -71,16 +76,16 @@ impl Config {
     /// # Errors
     /// When a discrepancy cannot be had.
     pub fn circulation(&self) -> Result<Circulation, ConfigError> {
-        let all: Vec<Discrepancy> = self.beliefs().iter().map(|belief| belief.what).collect();
+        let all: Vec<Discrepancy> = self.lacks().iter().map(|lack| lack.what).collect();
         Discrepant::new(self.patient.model(), &all).map_err(|error| ConfigError::discrepancy(&error))
     }
 
-    fn beliefs(&self) -> Vec<Belief> {
+    fn lacks(&self) -> Vec<Lack> {
         let model = self.patient.model();
-        let belief = |(name, settings): (&String, &DiscrepancySettings)| {
-            model.parameter_index(&format!("delta_{name}")).map(|p| Belief::new(name, settings, p))
+        let lack = |(name, settings): (&String, &DiscrepancySettings)| {
+            model.parameter_index(&format!("delta_{name}")).map(|p| Lack::new(name, settings, p))
         };
-        self.discrepancy.iter().filter_map(belief).collect()
+        self.discrepancy.iter().filter_map(lack).collect()
     }
 
     /// What an estimator is told: a checked configuration gives settings that an estimator accepts, unless its random
@@ -97,23 +102,25 @@ impl Config {
             }
         }
         let (window, estimator) = (&self.window, &self.estimator);
-        let (n, beliefs) = (model.n_states(), self.beliefs());
+        let (n, lacks) = (model.n_states(), self.lacks());
         // Discrepancies follow the pressures.
-        let with = |pressures: Vec<f64>, of: &dyn Fn(&Belief) -> f64| -> Vec<f64> {
-            pressures.into_iter().chain(beliefs.iter().map(of)).collect()
+        let with = |pressures: Vec<f64>, of: &dyn Fn(&Lack) -> f64| -> Vec<f64> {
+            pressures.into_iter().chain(lacks.iter().map(of)).collect()
         };
         Ok(EstimatorSettings {
             coupling: match estimator.coupling {
                 config::Coupling::Coupled => CouplingKind::Coupled,
                 config::Coupling::Independent => CouplingKind::Independent,
+                config::Coupling::Enkf => CouplingKind::Enkf,
+                config::Coupling::Ukf => CouplingKind::Ukf,
             },
             estimate: estimator.estimate.iter().filter_map(|name| model.parameter_index(name)).collect(),
             members: estimator.members,
             seed: estimator.seed,
             theta,
-            initial_guess_sd: estimator.initial_guess_sd,
+            beliefs: self.parameter_beliefs(),
             initial_state: with(self.patient.initial_pressures()?, &|_| 0.0),
-            initial_state_sd: with(self.patient.initial_sd(), &|belief| belief.initial_sd),
+            initial_state_sd: with(self.patient.initial_sd(), &|lack| lack.initial_sd),
             features: FeatureSpec {
                 activation: activation(window.activation),
                 count: window.neurons,
@@ -129,20 +136,45 @@ impl Config {
                 forecast_limit_ns: ns_from_s(window.forecast_limit_s),
             },
             weights: RowWeights {
-                physics: with(vec![window.physics_weight; n], &|belief| belief.weight(self)),
+                physics: with(vec![window.physics_weight; n], &|lack| lack.weight(self)),
                 data: window.data_weight,
                 parameter: window.parameter_weight,
             },
             drift: Drift {
-                parameters: estimator.parameter_drift,
-                states: with(vec![estimator.pressure_drift; n], &|belief| belief.drift),
+                states: with(vec![estimator.pressure_drift; n], &|lack| lack.drift),
                 inflation: estimator.inflation,
+            },
+            adaptation: if estimator.adaptive {
+                let [low, high] = estimator.noise_range;
+                Adaptation { noise: (low, high), outlier_sd: estimator.outlier_sd, ..Adaptation::ON }
+            } else {
+                Adaptation::OFF
             },
             stopping: Stopping { max_iterations: estimator.max_iterations, tolerance_mmhg: estimator.tolerance },
             channels: self.observed_channels(),
             aleatoric_sd_mmhg: with(self.channels.iter().map(|(_, c)| c.noise_sd).collect(), &|_| 0.0),
             publish_period_ns: ns_from_s(1.0 / self.publish.rate_hz),
         })
+    }
+
+    /// What is believed of each parameter: of all the same, but for the clock and for what the configuration names.
+    fn parameter_beliefs(&self) -> Vec<Belief> {
+        let estimator = &self.estimator;
+        let belief = |info: &ParameterInfo| {
+            let (sd, drift) = match info.name {
+                "heart_rate" => (HEART_RATE.0.min(estimator.initial_guess_sd), HEART_RATE.1),
+                "beat_phase" => BEAT_PHASE,
+                _ => (estimator.initial_guess_sd, estimator.parameter_drift),
+            };
+            let own = estimator.prior.get(info.name).copied().unwrap_or_default();
+            Belief {
+                sd: own.sd.unwrap_or(sd),
+                drift: own.drift.unwrap_or(drift),
+                reversion: own.reversion.unwrap_or(0.0),
+                bounds: (own.min.unwrap_or(info.bounds.0), own.max.unwrap_or(info.bounds.1)),
+            }
+        };
+        PARAMETERS.iter().map(belief).collect()
     }
 
     /// The observed states: one channel each, in this order.

@@ -4,6 +4,8 @@
 
 use std::collections::BTreeMap;
 
+use super::adapt::fit::ChannelFit;
+use super::beat::{BeatEstimate, BeatFollower};
 use super::ensemble::{
     Ensemble, Observation, Parallel, ParameterSummary, Serial, Snapshot, WindowReport, with_companions,
 };
@@ -42,6 +44,8 @@ pub enum Input {
 pub enum Output {
     /// An estimate at a published time.
     Estimate(Estimate),
+    /// A heart beat is over.
+    Beat(BeatEstimate),
     /// A window was solved.
     Window(WindowDone),
     /// Something happened.
@@ -180,6 +184,7 @@ pub struct Estimator<M> {
     /// End of the last window that said something about each estimated parameter.
     informed: Vec<EventTime>,
     want_members: bool,
+    beat: BeatFollower,
     scratch: Snapshot,
 }
 
@@ -208,6 +213,7 @@ impl<M: Model> Estimator<M> {
             last_observation: None,
             informed: Vec::new(),
             want_members: false,
+            beat: BeatFollower::default(),
             scratch: Snapshot::default(),
         })
     }
@@ -215,6 +221,16 @@ impl<M: Model> Estimator<M> {
     /// The model.
     pub fn model(&self) -> &M {
         &self.model
+    }
+
+    /// How a channel fits; None before the first window.
+    pub fn fit(&self, channel: usize) -> Option<&ChannelFit> {
+        self.ensemble.as_ref().map(|ensemble| ensemble.fit(channel))
+    }
+
+    /// See [`Ensemble::pace`]; None before the first window.
+    pub fn pace(&self, k: usize) -> Option<f64> {
+        self.ensemble.as_ref().map(|ensemble| ensemble.pace(k))
     }
 
     /// What it was told.
@@ -321,6 +337,7 @@ impl<M: Model> Estimator<M> {
             out.push(notice(self.time(), NoticeKind::Restart, None));
         }
         self.last_observation = None;
+        self.beat = BeatFollower::default();
     }
 
     fn solve(&mut self, window: &ClosedWindow, parallel: &dyn Parallel, out: &mut Vec<Output>) {
@@ -347,6 +364,7 @@ impl<M: Model> Estimator<M> {
         }
         self.tally(window, &report);
         self.publish(window, first, out);
+        self.follow_beat(window.end, out);
         let samples = window.observations.len();
         out.push(Output::Window(WindowDone { end: window.end, closed_at: window.closed_at, samples, report }));
     }
@@ -365,6 +383,15 @@ impl<M: Model> Estimator<M> {
             if *informed {
                 *at = window.end;
             }
+        }
+    }
+
+    fn follow_beat(&mut self, end: EventTime, out: &mut Vec<Output>) {
+        let Some(ensemble) = &self.ensemble else { return };
+        if let Some(beats) = ensemble.cycles() {
+            let values = ensemble.snapshot(1.0, &mut self.scratch);
+            let over = self.beat.follow(&self.model, end, beats, values, &|member| ensemble.theta_of(member));
+            out.extend(over.map(Output::Beat));
         }
     }
 

@@ -15,9 +15,14 @@
 //! One failed member never fails a window.
 //! Deliberately absent: names of topics, wire formats, wall-clock time.
 
+pub mod adapt;
+pub mod beat;
 pub mod coupling;
 pub mod ensemble;
 pub mod estimator;
+pub mod member;
+pub mod random;
+mod rivals;
 pub mod settings;
 pub mod statistics;
 pub mod time;

@@ -1,6 +1,8 @@
 //! Everything an estimator is told at the start. Plain values in mmHg, mL, s and nanoseconds; where they come from
 //! (files, environment, command line) and whether they make sense together is the business of the edge.
 
+use super::time::s_from_ns;
+use crate::model::{Model, ParameterInfo, Transform};
 use crate::xtfc::features::FeatureSpec;
 use crate::xtfc::problem::Stopping;
 
@@ -12,6 +14,25 @@ pub enum CouplingKind {
     Coupled,
     /// The paper's: members know nothing of each other; continuity between windows is hard.
     Independent,
+    /// Ensemble Kalman filter with a Runge-Kutta forecast: a rival of the field.
+    Enkf,
+    /// Unscented Kalman filter with a Runge-Kutta forecast: the rival a user would reach for first.
+    Ukf,
+}
+
+impl CouplingKind {
+    /// Whether members are draws from one posterior: starting guesses are spread, parameters wander, data are weighed
+    /// by their noise.
+    #[must_use]
+    pub fn is_bayesian(self) -> bool {
+        self != Self::Independent
+    }
+
+    /// Whether windows are solved by X-TFC.
+    #[must_use]
+    pub fn is_xtfc(self) -> bool {
+        matches!(self, Self::Coupled | Self::Independent)
+    }
 }
 
 /// One sensor.
@@ -36,6 +57,14 @@ pub struct WindowSettings {
     pub forecast_limit_ns: i64,
 }
 
+impl WindowSettings {
+    /// Length \[s\].
+    #[must_use]
+    pub fn length_s(&self) -> f64 {
+        s_from_ns(self.length_ns)
+    }
+}
+
 /// Weights of the rows; see [`problem`](crate::xtfc::problem).
 #[derive(Debug, Clone, PartialEq)]
 pub struct RowWeights {
@@ -47,15 +76,67 @@ pub struct RowWeights {
     pub parameter: f64,
 }
 
+/// What is believed of a parameter, in its coordinate (relative, for positive ones).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Belief {
+    /// Spread of the starting guess.
+    pub sd: f64,
+    /// Random walk, sd per square root of a second.
+    pub drift: f64,
+    /// Pull back to the starting guess \[1/s\].
+    pub reversion: f64,
+    /// Smallest and largest value that an estimate takes.
+    pub bounds: (f64, f64),
+}
+
+impl Belief {
+    /// Within the bounds of the model.
+    #[must_use]
+    pub fn within(info: &ParameterInfo, sd: f64, drift: f64) -> Self {
+        Self { sd, drift, reversion: 0.0, bounds: info.bounds }
+    }
+
+    /// The value at a coordinate, within the bounds.
+    #[must_use]
+    pub fn value(&self, transform: Transform, coordinate: f64) -> f64 {
+        transform.inverse(coordinate).clamp(self.bounds.0, self.bounds.1)
+    }
+
+    /// The same belief of every parameter of a model.
+    pub fn of_all<M: Model>(model: &M, sd: f64, drift: f64) -> Vec<Self> {
+        model.parameters().iter().map(|info| Self::within(info, sd, drift)).collect()
+    }
+}
+
 /// What the coupled ensemble assumes to change by itself.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Drift {
-    /// Random walk of every estimated coordinate (relative, for positive parameters), sd per square root of a second.
-    pub parameters: f64,
     /// Process noise of every state, in its own unit, sd per square root of a second; `[n_states]`.
     pub states: Vec<f64>,
     /// Multiplicative inflation of the prior covariance, per second; 1 is none.
     pub inflation: f64,
+}
+
+/// What the coupled ensemble may find out for itself.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Adaptation {
+    /// Whether the pace of parameters is learnt, around the one believed.
+    pub pace: bool,
+    /// Bounds of the sensors' noise found, in units of the one stated; (1, 1) leaves it.
+    pub noise: (f64, f64),
+    /// Largest process noise of a state whose sensor says that the model does not fit, in units of the one stated; 1
+    /// leaves it.
+    pub excess: f64,
+    /// Innovations beyond this many sd count as this many; infinite leaves all.
+    pub outlier_sd: f64,
+}
+
+impl Adaptation {
+    /// Everything as stated.
+    pub const OFF: Self = Self { pace: false, noise: (1.0, 1.0), excess: 1.0, outlier_sd: f64::INFINITY };
+
+    /// What suits signals from people.
+    pub const ON: Self = Self { pace: true, noise: (0.4, 3.0), excess: 1e4, outlier_sd: 4.0 };
 }
 
 /// Everything else.
@@ -71,8 +152,8 @@ pub struct EstimatorSettings {
     pub seed: u64,
     /// Parameters assumed or guessed at event time 0, `[n_parameters]`.
     pub theta: Vec<f64>,
-    /// Spread of the starting guesses of estimated parameters (relative, for positive ones); `coupled` only.
-    pub initial_guess_sd: f64,
+    /// What is believed of each parameter, `[n_parameters]`; not used by `independent`.
+    pub beliefs: Vec<Belief>,
     /// Initial states (pressures \[mmHg\], discrepancies), `[n_states]`.
     pub initial_state: Vec<f64>,
     /// Their spread, `[n_states]`.
@@ -85,6 +166,8 @@ pub struct EstimatorSettings {
     pub weights: RowWeights,
     /// Drift.
     pub drift: Drift,
+    /// What is left to the ensemble itself; `coupled` only.
+    pub adaptation: Adaptation,
     /// When a member's iteration stops.
     pub stopping: Stopping,
     /// Sensors listened to.

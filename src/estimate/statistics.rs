@@ -1,5 +1,7 @@
 //! Summaries of an ensemble.
 
+use super::random::Directions;
+
 /// One quantity: where it is, and how uncertain by source.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Summary {
@@ -18,6 +20,34 @@ pub struct Summary {
     /// 95 % quantile of the true quantity, without sensor noise.
     pub q95: f64,
 }
+
+impl Summary {
+    /// With an error of the model of this sd beside what the members know of it.
+    #[must_use]
+    pub fn widened(self, model_sd: f64) -> Self {
+        if model_sd <= 0.0 {
+            return self;
+        }
+        let spread = self.epistemic_sd.hypot(self.model_sd);
+        let wider = spread.hypot(model_sd);
+        // Spread evenly, as far as it is known; a Gaussian where the members know no better.
+        let (low, high) = if spread > 0.0 {
+            ((self.mean - self.q05) * wider / spread, (self.q95 - self.mean) * wider / spread)
+        } else {
+            (NORMAL_95 * model_sd, NORMAL_95 * model_sd)
+        };
+        Self {
+            sd: self.sd.hypot(model_sd),
+            model_sd: self.model_sd.hypot(model_sd),
+            q05: self.mean - low,
+            q95: self.mean + high,
+            ..self
+        }
+    }
+}
+
+/// 95 % quantile of the standard normal distribution.
+const NORMAL_95: f64 = 1.644_853_626_951_472_7;
 
 /// Summarises one quantity over the members; `values` is sorted on return. `model_share` is the share of their variance
 /// that belongs to the model ([`Explainers::share_of`]).
@@ -40,29 +70,16 @@ pub fn summarise(values: &mut [f64], aleatoric_sd: f64, model_share: f64) -> Sum
 #[derive(Debug, Clone, Default)]
 pub struct Explainers {
     members: usize,
-    /// Orthonormal and centred, one per independent variable, `[n x n_members]`.
-    directions: Vec<f64>,
+    directions: Directions,
 }
 
 impl Explainers {
     /// From the rows of `variables`, each `[n_members]`.
     #[must_use]
     pub fn new(variables: &[f64], members: usize) -> Self {
-        let mut all = Self { members, directions: Vec::new() };
-        for variable in variables.chunks_exact(members) {
-            let mut rest = centred(variable);
-            let before = norm(&rest);
-            // Twice, because once is not orthogonal to rounding.
-            for direction in all.directions.chunks_exact(members).chain(all.directions.chunks_exact(members)) {
-                let along: f64 = direction.iter().zip(&rest).map(|(a, b)| a * b).sum();
-                rest.iter_mut().zip(direction).for_each(|(r, d)| *r -= along * d);
-            }
-            let length = norm(&rest);
-            if length > 1e-9 * before {
-                all.directions.extend(rest.iter().map(|r| r / length));
-            }
-        }
-        all
+        let mut directions = Directions::new(members);
+        variables.chunks_exact(members).for_each(|variable| directions.add(variable));
+        Self { members, directions }
     }
 
     /// The share of the variance of `values` `[n_members]` that a linear regression on these variables explains,
@@ -70,13 +87,12 @@ impl Explainers {
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn share_of(&self, values: &[f64]) -> f64 {
-        let count = self.directions.len().checked_div(self.members).unwrap_or(0);
+        let count = self.directions.len();
         if count == 0 || self.members < count + 2 {
             return 0.0;
         }
         let centred = centred(values);
-        let along = |direction: &[f64]| direction.iter().zip(&centred).map(|(a, b)| a * b).sum::<f64>().powi(2);
-        let explained: f64 = self.directions.chunks_exact(self.members).map(along).sum();
+        let explained: f64 = self.directions.along(&centred).map(|along| along * along).sum();
         let total = norm(&centred).powi(2);
         if total <= 0.0 {
             return 0.0;
@@ -87,7 +103,7 @@ impl Explainers {
 }
 
 #[allow(clippy::cast_precision_loss)]
-fn centred(values: &[f64]) -> Vec<f64> {
+pub(super) fn centred(values: &[f64]) -> Vec<f64> {
     let mean = values.iter().sum::<f64>() / values.len() as f64;
     values.iter().map(|v| v - mean).collect()
 }

@@ -3,7 +3,7 @@
 use nalgebra::{SMatrix, SVector};
 
 use super::capacitance::{Activation, Capacitance, ValueAndRate};
-use super::{InductancePath, Model, ParameterInfo, Quantity, Transform};
+use super::{Cycle, Extent, InductancePath, Model, ParameterInfo, Quantity, Transform};
 use crate::named_vector;
 
 /// Pascals-in-cgs per mmHg: the literature states CVSim-6 in Ba, the program computes in mmHg.
@@ -161,6 +161,34 @@ const DERIVED: &[Quantity] = &[
     volume("v_r"),
     volume("v_pa"),
     volume("v_pv"),
+];
+
+/// Of the left ventricle and the two circulations, then of each pressure.
+const CLINICAL: &[Quantity] = &[
+    Quantity { name: "heart_rate", unit: "bpm" },
+    Quantity { name: "stroke_volume", unit: "mL" },
+    Quantity { name: "cardiac_output", unit: "L/min" },
+    Quantity { name: "ejection_fraction", unit: "" },
+    Quantity { name: "svr", unit: "mmHg s/mL" },
+    Quantity { name: "pvr", unit: "mmHg s/mL" },
+    mmhg("p_l_systolic"),
+    mmhg("p_l_diastolic"),
+    mmhg("p_l_mean"),
+    mmhg("p_a_systolic"),
+    mmhg("p_a_diastolic"),
+    mmhg("p_a_mean"),
+    mmhg("p_v_systolic"),
+    mmhg("p_v_diastolic"),
+    mmhg("p_v_mean"),
+    mmhg("p_r_systolic"),
+    mmhg("p_r_diastolic"),
+    mmhg("p_r_mean"),
+    mmhg("p_pa_systolic"),
+    mmhg("p_pa_diastolic"),
+    mmhg("p_pa_mean"),
+    mmhg("p_pv_systolic"),
+    mmhg("p_pv_diastolic"),
+    mmhg("p_pv_mean"),
 ];
 
 /// The parameter table: defaults of the paper, converted from Ba to mmHg.
@@ -619,6 +647,32 @@ impl Model for Cvsim6 {
         let rate = theta[Parameter::HeartRate as usize] / 60.0;
         // Not wrapped: the spread of the phase over an ensemble must not jump at the onset of a beat.
         theta[Parameter::BeatPhase as usize] += dt_s * rate;
+    }
+
+    fn cycle(&self) -> Option<Cycle> {
+        Some(Cycle { rate: Parameter::HeartRate as usize, phase: Parameter::BeatPhase as usize })
+    }
+
+    fn clinical(&self) -> &[Quantity] {
+        CLINICAL
+    }
+
+    fn read_cycle(&self, duration_s: f64, theta: &[f64], states: &[Extent], derived: &[Extent], out: &mut [f64]) {
+        let drop = |from: State, to: State| states[from as usize].mean - states[to as usize].mean;
+        // What left the arteries and what they kept: in the model the same as what the ventricle put out, and right
+        // also where data had to correct a model that does not fit.
+        let kept = theta[Parameter::CA as usize] * states[State::A as usize].change / duration_s;
+        let flow = derived[Derived::QA as usize].mean + kept;
+        let volume = derived[Derived::VL as usize];
+        out[0] = 60.0 / duration_s;
+        out[1] = flow * duration_s;
+        out[2] = flow * 60.0 / 1000.0;
+        out[3] = (volume.max - volume.min) / volume.max;
+        out[4] = drop(State::A, State::V) / flow;
+        out[5] = drop(State::Pa, State::Pv) / flow;
+        for (out, pressure) in out[6..].chunks_exact_mut(3).zip(states) {
+            out.copy_from_slice(&[pressure.max, pressure.min, pressure.mean]);
+        }
     }
 
     fn next_corner(&self, t_s: f64, until_s: f64, theta: &[f64]) -> Option<f64> {

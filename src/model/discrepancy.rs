@@ -1,7 +1,7 @@
 #![doc = include_str!("discrepancy.md")]
 
 use super::cvsim6::Cvsim6;
-use super::{InductancePath, Model, ParameterInfo, Quantity};
+use super::{Cycle, Extent, InductancePath, Model, ParameterInfo, Quantity};
 
 /// Most states of a model, discrepancies included.
 pub const MAX_STATES: usize = 20;
@@ -234,6 +234,18 @@ impl<M: Model> Model for Discrepant<M> {
 
     fn advance(&self, dt_s: f64, theta: &mut [f64]) {
         self.base.advance(dt_s, theta);
+    }
+
+    fn cycle(&self) -> Option<Cycle> {
+        self.base.cycle()
+    }
+
+    fn clinical(&self) -> &[Quantity] {
+        self.base.clinical()
+    }
+
+    fn read_cycle(&self, duration_s: f64, theta: &[f64], states: &[Extent], derived: &[Extent], out: &mut [f64]) {
+        self.base.read_cycle(duration_s, theta, &states[..self.base.n_states()], derived, out);
     }
 
     fn next_corner(&self, t_s: f64, until_s: f64, theta: &[f64]) -> Option<f64> {

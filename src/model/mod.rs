@@ -15,6 +15,7 @@ pub mod discrepancy;
 pub mod harmonic;
 pub mod lorenz;
 pub mod oscillator;
+pub mod rk4;
 pub mod truth;
 
 pub mod adding_a_model {
@@ -162,6 +163,33 @@ pub struct InductancePath {
     pub resistance: usize,
 }
 
+/// Parameters that make a model periodic: a rate cannot be learnt without the clock it drives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Cycle {
+    /// The parameter that is the rate \[1/min\].
+    pub rate: usize,
+    /// The clock parameter that counts cycles; one begins at every integer.
+    pub phase: usize,
+}
+
+/// What a quantity did during a cycle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Extent {
+    /// Smallest value.
+    pub min: f64,
+    /// Largest value.
+    pub max: f64,
+    /// Mean over time.
+    pub mean: f64,
+    /// Value at the end minus value at the start.
+    pub change: f64,
+}
+
+impl Extent {
+    /// Of nothing yet.
+    pub const EMPTY: Self = Self { min: f64::INFINITY, max: f64::NEG_INFINITY, mean: 0.0, change: 0.0 };
+}
+
 /// A system of ordinary differential equations with exact first derivatives.
 ///
 /// Time `t` is measured from the start of the current window. Whatever must survive from window to window
@@ -198,6 +226,22 @@ pub trait Model: Clone + Send + Sync + 'static {
     /// Moves the clock parameters on by `dt_s`; none unless said otherwise.
     fn advance(&self, dt_s: f64, theta: &mut [f64]) {
         let _ = (dt_s, theta);
+    }
+
+    /// What makes it periodic, if anything does.
+    fn cycle(&self) -> Option<Cycle> {
+        None
+    }
+
+    /// What clinicians read off a cycle, in order; nothing unless said otherwise.
+    fn clinical(&self) -> &[Quantity] {
+        &[]
+    }
+
+    /// Clinical quantities of a cycle of `duration_s`; `states`: `[n_states]`, `derived`: `[n_derived]`, `out`:
+    /// `[n_clinical]`.
+    fn read_cycle(&self, duration_s: f64, theta: &[f64], states: &[Extent], derived: &[Extent], out: &mut [f64]) {
+        let _ = (duration_s, theta, states, derived, out);
     }
 
     /// The first time in `(t_s, until_s)` at which `f` is not smooth in `t`, if any.

@@ -8,7 +8,9 @@ use super::experiment::{Experiment, Sample, Trace};
 use super::plot::{Chart, Colour, Figure};
 use super::report::{Report, Table, mean, plus_minus, rms, short};
 use super::{Context, StudyError, timed};
-use crate::estimate::settings::{ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings};
+use crate::estimate::settings::{
+    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
+};
 use crate::estimate::statistics::{Summary, mean_and_sd};
 use crate::estimate::time::ns_from_s;
 use crate::model::Model;
@@ -95,7 +97,7 @@ impl Setup {
             members: self.members,
             seed: self.seed,
             theta,
-            initial_guess_sd: 0.3,
+            beliefs: Belief::of_all(model, 0.3, 0.0),
             initial_state: with(X0, 0.0),
             initial_state_sd: with(0.0, 0.0),
             features: FeatureSpec {
@@ -113,7 +115,8 @@ impl Setup {
                 data: 1.0,
                 parameter: self.parameter_weight,
             },
-            drift: Drift { parameters: 0.0, states: with(0.0, 0.0), inflation: 1.0 },
+            drift: Drift { states: with(0.0, 0.0), inflation: 1.0 },
+            adaptation: Adaptation::OFF,
             stopping: Stopping { max_iterations: 50, tolerance_mmhg: 1e-6 },
             channels: vec![ChannelSettings {
                 state: 0,

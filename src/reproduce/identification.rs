@@ -8,7 +8,9 @@ use super::experiment::{Experiment, Sample, Trace};
 use super::plot::{Chart, Colour, Figure};
 use super::report::{Report, Table, mean, rms, short};
 use super::{Context, StudyError};
-use crate::estimate::settings::{ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings};
+use crate::estimate::settings::{
+    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
+};
 use crate::estimate::time::{NS_PER_S, ns_from_s};
 use crate::model::Model;
 use crate::model::discrepancy::{Discrepancy, Discrepant, Form};
@@ -222,7 +224,7 @@ impl<M: Model> Task<'_, M> {
             members,
             seed: 1,
             theta: model.default_parameters(),
-            initial_guess_sd: 0.1,
+            beliefs: Belief::of_all(model, 0.1, 0.0),
             initial_state: padded(start.to_vec(), 0.0),
             initial_state_sd: padded(vec![0.0; n], 0.0),
             features: FeatureSpec {
@@ -238,7 +240,8 @@ impl<M: Model> Task<'_, M> {
                 forecast_limit_ns: i64::MAX,
             },
             weights: RowWeights { physics: padded(vec![1.0; n], UNKNOWN_WEIGHT), data: DATA_WEIGHT, parameter: 1.0 },
-            drift: Drift { parameters: 0.0, states: padded(vec![0.0; n], 0.0), inflation: 1.0 },
+            drift: Drift { states: padded(vec![0.0; n], 0.0), inflation: 1.0 },
+            adaptation: Adaptation::OFF,
             stopping: Stopping { max_iterations: 50, tolerance_mmhg: 1e-8 },
             channels: (0..n).map(channel).collect(),
             aleatoric_sd_mmhg: padded(vec![self.noise_sd; n], 0.0),

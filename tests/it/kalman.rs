@@ -2,7 +2,7 @@
 
 use hemostream::estimate::ensemble::{Ensemble, Observation, Serial};
 use hemostream::estimate::settings::{
-    ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
+    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
 };
 use hemostream::model::{Model, ParameterInfo, Quantity, Transform};
 use hemostream::xtfc::features::FeatureSpec;
@@ -69,7 +69,7 @@ fn settings(members: usize) -> EstimatorSettings {
         members,
         seed: 7,
         theta: vec![1.0],
-        initial_guess_sd: 2.0,
+        beliefs: Belief::of_all(&Linear, 2.0, DRIFT_U),
         initial_state: vec![1.0, -0.5],
         initial_state_sd: vec![1.0, 0.8],
         features: FeatureSpec::default(),
@@ -79,7 +79,8 @@ fn settings(members: usize) -> EstimatorSettings {
             forecast_limit_ns: 1_000_000_000,
         },
         weights: RowWeights { physics: vec![1e4; 2], data: 1.0, parameter: 10.0 },
-        drift: Drift { parameters: DRIFT_U, states: vec![DRIFT_X; 2], inflation: 1.0 },
+        drift: Drift { states: vec![DRIFT_X; 2], inflation: 1.0 },
+        adaptation: Adaptation::OFF,
         stopping: Stopping::default(),
         channels: vec![ChannelSettings { state: 0, noise_sd_mmhg: NOISE, plausible_mmhg: (-1e3, 1e3) }],
         aleatoric_sd_mmhg: vec![NOISE, 0.0],

@@ -237,6 +237,7 @@ impl Observer {
     fn see(&mut self, output: &Output) {
         match output {
             Output::Estimate(estimate) => self.estimate(estimate),
+            Output::Beat(_) => {}
             Output::Window(window) => self.window(window),
             Output::Notice(notice) => self.notice(notice),
         }

@@ -3,7 +3,7 @@
 use hemostream::estimate::ensemble::Serial;
 use hemostream::estimate::estimator::{Estimate, Estimator, Input, Output};
 use hemostream::estimate::settings::{
-    ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
+    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
 };
 use hemostream::estimate::time::{ArrivalTime, EventTime, ns_from_s};
 use hemostream::estimate::window::RawSample;
@@ -35,7 +35,7 @@ pub fn settings(coupling: CouplingKind, observed: &[State], estimate: &[Paramete
         members: 100,
         seed: 1,
         theta,
-        initial_guess_sd: 0.3,
+        beliefs: Belief::of_all(&model, 0.3, 0.02),
         initial_state_sd: initial_state.iter().map(|p| 0.04 * p).collect(),
         initial_state,
         features: FeatureSpec::default(),
@@ -45,7 +45,8 @@ pub fn settings(coupling: CouplingKind, observed: &[State], estimate: &[Paramete
             forecast_limit_ns: 10_000_000_000,
         },
         weights: RowWeights { physics: vec![1.0; 6], data: 1.0, parameter: 10.0 },
-        drift: Drift { parameters: 0.02, states: vec![0.01; 6], inflation: 1.0 },
+        drift: Drift { states: vec![0.01; 6], inflation: 1.0 },
+        adaptation: Adaptation::OFF,
         stopping: Stopping::default(),
         channels: observed.iter().map(channel).collect(),
         aleatoric_sd_mmhg: NOISE.to_vec(),
@@ -116,7 +117,7 @@ impl Run {
 #[test]
 fn coupled_finds_resistance_and_compliance_from_two_channels() {
     let model = Cvsim6::default();
-    let seeds = 6;
+    let seeds = 12;
     let mut mean_coverage = [0.0; 6];
     for seed in 0..seeds {
         let mut settings = settings(CouplingKind::Coupled, &[State::A, State::Pa], &[Parameter::RPv, Parameter::CA]);
@@ -169,7 +170,7 @@ fn every_parameter_can_be_estimated() {
     assert_eq!(all.len(), 18, "sixteen physical ones, p_th and the beat phase");
     let mut settings = settings(CouplingKind::Coupled, &[State::A, State::V, State::Pa], &[]);
     settings.estimate = all.clone();
-    settings.initial_guess_sd = 0.05;
+    settings.beliefs.iter_mut().for_each(|b| b.sd = 0.05);
     settings.members = 60;
     settings.theta[Parameter::RPv as usize] *= 1.1;
     let run = watch(&settings, 2.0, 125.0, 9);

@@ -10,7 +10,9 @@ use super::error::{ConfigError, Problem};
 use super::keys::{self, KeyPath};
 use super::layers::Stack;
 use super::patient::{InitialSd, Patient, ScriptEntry};
-use super::schema::{Config, DiscrepancyForm, Distribution, EstimatorSettings, PublishSettings, WindowSettings};
+use super::schema::{
+    Config, DiscrepancyForm, Distribution, EstimatorSettings, PriorSettings, PublishSettings, WindowSettings,
+};
 use crate::model::cvsim6::{Cvsim6, PARAMETERS, Pressures};
 use crate::model::{Model, ParameterInfo};
 
@@ -233,6 +235,14 @@ impl Checker {
         self.number("estimator.parameter_drift", estimator.parameter_drift, &(0.0..=10.0), " /sqrt(s)");
         self.number("estimator.pressure_drift", estimator.pressure_drift, &(0.0..=100.0), " mmHg/sqrt(s)");
         self.number("estimator.inflation", estimator.inflation, &(1.0..=100.0), " per second");
+        for (name, prior) in &estimator.prior {
+            self.prior(name, prior, &estimator.estimate);
+        }
+        let [low, high] = estimator.noise_range;
+        self.number("estimator.noise_range.0", low, &positive_to(1.0), "");
+        self.number("estimator.noise_range.1", high, &(1.0..=1000.0), "");
+        self.number("estimator.outlier_sd", estimator.outlier_sd, &(1.0..=1e9), "");
+        self.number("estimator.smoothing_lag_s", estimator.smoothing_lag_s, &(0.0..=60.0), " s");
         self.whole("estimator.max_iterations", estimator.max_iterations, 1..=100);
         let fraction = (Bound::Excluded(0.0), Bound::Excluded(1.0));
         self.number("estimator.tolerance", estimator.tolerance, &fraction, "");
@@ -289,6 +299,26 @@ impl Checker {
                 let message = format!("found a guess of what is not in `estimator.estimate`, expected {estimated}");
                 self.refuse_against(key, "estimator.estimate", message);
             }
+        }
+    }
+
+    fn prior(&mut self, name: &str, prior: &PriorSettings, estimate: &[String]) {
+        let key = KeyPath::from("estimator.prior").join(name);
+        let companion = name == "beat_phase" && estimate.iter().any(|estimated| estimated == "heart_rate");
+        let Some(info) = parameter(name).filter(|_| companion || estimate.iter().any(|estimated| estimated == name))
+        else {
+            let estimated = estimate.join(", ");
+            let message = format!("found a prior of what is not in `estimator.estimate`, expected {estimated}");
+            return self.refuse_against(key, "estimator.estimate", message);
+        };
+        self.number(key.clone().join("sd"), prior.sd.unwrap_or(1.0), &positive_to(10.0), "");
+        self.number(key.clone().join("drift"), prior.drift.unwrap_or(0.0), &(0.0..=10.0), " /sqrt(s)");
+        self.number(key.clone().join("reversion"), prior.reversion.unwrap_or(0.0), &(0.0..=1000.0), " /s");
+        let (low, high) = (prior.min.unwrap_or(info.bounds.0), prior.max.unwrap_or(info.bounds.1));
+        self.bounds(key.clone().join("min"), info, low);
+        self.bounds(key.clone().join("max"), info, high);
+        if low >= high {
+            self.refuse(key.join("min"), format!("found {low:?}, expected less than `max` ({high:?})"));
         }
     }
 

@@ -93,10 +93,58 @@ pub struct EstimatorSettings {
     pub pressure_drift: f64,
     /// Factor by which the spread grows in one second.
     pub inflation: f64,
+    /// What is believed of single parameters.
+    pub prior: BTreeMap<String, PriorSettings>,
+    /// Whether the pace of parameters, the noise of sensors and the fit of the model are learnt on the way.
+    pub adaptive: bool,
+    /// Bounds of the sensor noise that is learnt, in units of the one stated.
+    #[serde(deserialize_with = "pair")]
+    pub noise_range: [f64; 2],
+    /// Innovations beyond so many standard deviations pull no more than this one does.
+    pub outlier_sd: f64,
+    /// Where the beat comes from.
+    #[serde(deserialize_with = "by_name")]
+    pub timing: Timing,
+    /// How far estimates are looked back at \[s\]; 0 is not.
+    pub smoothing_lag_s: f64,
     /// Gauss-Newton iterations of one window.
     pub max_iterations: usize,
     /// Error of the pressures left by the linearisation at which iterations stop \[mmHg\].
     pub tolerance: f64,
+}
+
+/// `[estimator.prior.NAME]`; what is left out is that of all parameters.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PriorSettings {
+    /// Spread at the start (relative).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sd: Option<f64>,
+    /// Random walk \[1/sqrt(s)\].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub drift: Option<f64>,
+    /// Pull back to the initial guess \[1/s\].
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reversion: Option<f64>,
+    /// Smallest value, in the unit of the parameter.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub min: Option<f64>,
+    /// Largest value.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub max: Option<f64>,
+}
+
+/// Where the heart beat comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Timing {
+    /// Heart rate and phase of the patient's table, or estimated from there.
+    #[default]
+    Config,
+    /// Onsets received on the `beat` topic.
+    Beats,
+    /// Onsets found in the pressures, then heart rate and phase as parameters.
+    Tracked,
 }
 
 /// How data enter the solve.
@@ -108,6 +156,10 @@ pub enum Coupling {
     Coupled,
     /// Every member fits its own perturbed data, as in the paper.
     Independent,
+    /// Ensemble Kalman filter with a Runge-Kutta forecast, to compare with.
+    Enkf,
+    /// Unscented Kalman filter with a Runge-Kutta forecast, to compare with.
+    Ukf,
 }
 
 /// `[discrepancy.NAME]`; flows are in mL/s, what a balance lacks in mmHg/s.
@@ -328,8 +380,14 @@ impl Default for EstimatorSettings {
             members: 100,
             seed: 1,
             parameter_drift: 0.02,
-            pressure_drift: 0.01,
+            pressure_drift: 0.001,
             inflation: 1.0,
+            prior: BTreeMap::new(),
+            adaptive: true,
+            noise_range: [0.4, 3.0],
+            outlier_sd: 4.0,
+            timing: Timing::Config,
+            smoothing_lag_s: 0.0,
             max_iterations: 20,
             tolerance: 1e-9,
         }

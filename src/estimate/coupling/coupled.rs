@@ -4,38 +4,33 @@
 //! coordinates) as covariance. With perturbed observations this is randomised maximum likelihood; for a linear model
 //! it is the stochastic ensemble Kalman filter, and tends to the exact Kalman filter as members are added.
 
+use crate::estimate::statistics::centred;
+
 /// Pivots below this share of the variance they came from are rounding: the direction has no spread left.
 const SINGULAR: f64 = 1e-12;
 
-/// A triangular root of the sample covariance of the rows of `samples` `[n_members x n]`: `root root^T = covariance`.
+/// A triangular root of the sample covariance of `rows` `[n x n_members]`: `root root^T = covariance`.
 ///
 /// `root` is `[n x n]`, row-major, lower triangular. A singular covariance (fewer members than unknowns, something
 /// known exactly) leaves zero columns: directions without spread do not move.
 #[allow(clippy::cast_precision_loss)]
-pub fn covariance_root(samples: &[f64], n: usize, root: &mut Vec<f64>) {
-    let members = samples.len() / n;
-    let mut mean = vec![0.0; n];
-    for row in samples.chunks_exact(n) {
-        mean.iter_mut().zip(row).for_each(|(m, v)| *m += v);
-    }
-    mean.iter_mut().for_each(|m| *m /= members as f64);
+pub fn covariance_root(rows: &[f64], members: usize, root: &mut Vec<f64>) {
+    let deviations: Vec<Vec<f64>> = rows.chunks_exact(members).map(centred).collect();
+    let n = deviations.len();
     root.clear();
     root.resize(n * n, 0.0);
     let degrees = (members as f64 - 1.0).max(1.0);
-    let mut deviation = vec![0.0; n];
-    for row in samples.chunks_exact(n) {
-        deviation.iter_mut().zip(row).zip(&mean).for_each(|((d, v), m)| *d = v - m);
-        for i in 0..n {
-            for j in 0..=i {
-                root[i * n + j] += deviation[i] * deviation[j] / degrees;
-            }
+    for i in 0..n {
+        for j in 0..=i {
+            let product: f64 = deviations[i].iter().zip(&deviations[j]).map(|(a, b)| a * b).sum();
+            root[i * n + j] = product / degrees;
         }
     }
     semidefinite_cholesky(root, n);
 }
 
 /// Cholesky in place on the lower triangle; columns without variance become zero.
-fn semidefinite_cholesky(a: &mut [f64], n: usize) {
+pub(crate) fn semidefinite_cholesky(a: &mut [f64], n: usize) {
     for j in 0..n {
         let variance = a[j * n + j];
         let known: f64 = (0..j).map(|k| a[j * n + k] * a[j * n + k]).sum();
@@ -60,17 +55,16 @@ mod tests {
     #[test]
     fn the_root_squares_to_the_sample_covariance() {
         // Third column = first + second: singular.
-        let samples: Vec<f64> =
-            [(1.0, 2.0), (0.5, -1.0), (-2.0, 0.3), (0.1, 0.4)].iter().flat_map(|&(a, b)| [a, b, a + b]).collect();
+        let (a, b) = ([1.0, 0.5, -2.0, 0.1], [2.0, -1.0, 0.3, 0.4]);
+        let rows: Vec<f64> = a.into_iter().chain(b).chain(std::array::from_fn::<f64, 4, _>(|i| a[i] + b[i])).collect();
         let mut root = Vec::new();
-        covariance_root(&samples, 3, &mut root);
+        covariance_root(&rows, 4, &mut root);
         for i in 0..3 {
             for j in 0..3 {
                 let product: f64 = (0..3).map(|k| root[i * 3 + k] * root[j * 3 + k]).sum();
-                let column = |c: usize| samples.iter().skip(c).step_by(3).copied().collect::<Vec<f64>>();
-                let (a, b) = (column(i), column(j));
+                let (a, b) = (&rows[4 * i..4 * i + 4], &rows[4 * j..4 * j + 4]);
                 let (ma, mb) = (a.iter().sum::<f64>() / 4.0, b.iter().sum::<f64>() / 4.0);
-                let covariance: f64 = a.iter().zip(&b).map(|(x, y)| (x - ma) * (y - mb)).sum::<f64>() / 3.0;
+                let covariance: f64 = a.iter().zip(b).map(|(x, y)| (x - ma) * (y - mb)).sum::<f64>() / 3.0;
                 assert!((product - covariance).abs() < 1e-12, "{product} against {covariance}");
             }
         }

@@ -1,0 +1,206 @@
+//! Whether sensors and model do what the settings say, channel by channel.
+//!
+//! With the right model the normalised innovations of a channel are white with variance 1. Two things are told apart:
+//! noise that is larger or smaller than stated shows in the differences of neighbouring innovations; a model that does
+//! not fit shows in innovations that agree with their neighbours, so that their sum over a tenth of a second is larger
+//! than it should be.
+
+/// Stretches over which innovations are summed up \[s\], and how many there must be in each: what a model misses may
+/// last for a moment or for half a beat.
+const BLOCKS_S: [f64; 2] = [0.1, 0.4];
+const BLOCK_MIN: usize = 5;
+
+/// Longest time between neighbours \[s\].
+const NEIGHBOURS_S: f64 = 0.1;
+
+/// Memory of the noise, in samples; as many samples' worth of belief in the setting at the start.
+const NOISE_MEMORY: f64 = 1000.0;
+
+/// Memory of the mean square that is published, per sample.
+const PUBLISHED_MEMORY: f64 = 0.005;
+
+/// Memory of the mean squares of blocks \[s\]: some tens of blocks each.
+const MEMORY_S: [f64; 2] = [4.0, 10.0];
+
+/// Largest square of a block that counts: a beat that the model missed is not a thousand.
+const MAX_SQUARE: f64 = 9.0;
+
+/// Above this mean square of blocks the states are believed to do what the model does not say.
+const ARMED: f64 = 1.3;
+
+/// Mean square that extra noise aims at once it is.
+const AIM: f64 = 1.2;
+
+/// Change of the logarithm of the extra noise per second and unit of excess.
+const GAIN_PER_S: [f64; 2] = [2.0, 0.7];
+
+/// Phases of the beat that are told apart, and the share of what they say that is kept from beat to beat: what a model
+/// misses comes back with every beat, and stands out from the noise when some twenty are laid over each other.
+const PHASES: usize = 16;
+const KEPT_PER_BEAT: f64 = 0.95;
+
+/// Mean square of the phases above which what comes back is hardly an accident (3 % of the channels that fit).
+const SYSTEMATIC: f64 = 1.7;
+
+/// Innovations of one phase of the beat.
+#[derive(Debug, Clone, Copy, Default)]
+struct Phase {
+    sum: f64,
+    weight: f64,
+    square_weight: f64,
+}
+
+/// Fit of one channel.
+#[derive(Debug, Clone)]
+pub struct ChannelFit {
+    /// Bounds of the noise found, as shares of the one stated.
+    noise_range: (f64, f64),
+    /// Square of the noise over that stated.
+    noise_square: f64,
+    /// Residual \[in stated noise sd\] and time of the last sample.
+    last: Option<(f64, f64)>,
+    /// Blocks: start, sum of normalised innovations, their number.
+    blocks: [(f64, f64, usize); 2],
+    /// Mean square of normalised innovations, lately.
+    square: Option<f64>,
+    /// Mean square of blocks of each length, lately.
+    whiteness: [f64; 2],
+    phases: [Phase; PHASES],
+    /// Phase of the last sample.
+    phase: usize,
+    /// Variance that members and noise give to a sample \[mmHg^2\].
+    variance: f64,
+    /// Logarithm of the extra noise of the state.
+    log_excess: f64,
+    max_log_excess: f64,
+}
+
+impl ChannelFit {
+    /// Everything as stated.
+    #[must_use]
+    pub fn new(noise_range: (f64, f64), max_excess: f64) -> Self {
+        Self {
+            noise_range,
+            noise_square: 1.0,
+            last: None,
+            blocks: [(f64::NEG_INFINITY, 0.0, 0); 2],
+            square: None,
+            whiteness: [1.0; 2],
+            phases: [Phase::default(); PHASES],
+            phase: 0,
+            variance: 0.0,
+            log_excess: 0.0,
+            max_log_excess: max_excess.max(1.0).ln(),
+        }
+    }
+
+    /// Noise of the sensor over that stated.
+    #[must_use]
+    pub fn noise_factor(&self) -> f64 {
+        self.noise_square.sqrt().clamp(self.noise_range.0, self.noise_range.1)
+    }
+
+    /// Process noise of the observed state over that stated.
+    #[must_use]
+    pub fn excess(&self) -> f64 {
+        self.log_excess.exp()
+    }
+
+    /// Root mean square of the normalised innovations, lately; NaN before any.
+    #[must_use]
+    pub fn innovation_rms(&self) -> f64 {
+        self.square.map_or(f64::NAN, f64::sqrt)
+    }
+
+    /// Mean square of sums of neighbouring normalised innovations, lately: 1 when they are white.
+    #[must_use]
+    pub fn whiteness(&self) -> f64 {
+        self.whiteness[0].max(self.whiteness[1])
+    }
+
+    /// Mean square of the innovations averaged over beats at the same phase, in units of what noise leaves of them: 1 when
+    /// nothing comes back with every beat.
+    #[must_use]
+    #[allow(clippy::cast_precision_loss)]
+    pub fn recurrence(&self) -> f64 {
+        let square = |phase: &Phase| phase.sum * phase.sum / phase.square_weight;
+        let known: Vec<f64> = self.phases.iter().filter(|phase| phase.square_weight > 0.0).map(square).collect();
+        if known.len() < PHASES / 2 { 1.0 } else { known.iter().sum::<f64>() / known.len() as f64 }
+    }
+
+    /// Standard deviation of what the model misses in every beat, as far as it stands out of the noise \[mmHg\].
+    #[must_use]
+    #[allow(clippy::cast_precision_loss)]
+    pub fn systematic_sd(&self) -> f64 {
+        if self.recurrence() < SYSTEMATIC {
+            return 0.0;
+        }
+        // The square of a mean is larger than that of what it estimates, by the variance of the mean.
+        let square = |phase: &Phase| (phase.sum * phase.sum - phase.square_weight) / (phase.weight * phase.weight);
+        let known: Vec<f64> = self.phases.iter().filter(|phase| phase.weight > 0.0).map(square).collect();
+        (known.iter().sum::<f64>() / known.len() as f64 * self.variance).max(0.0).sqrt()
+    }
+
+    /// Hears of a sample: its time and phase of the beat in `[0, 1)`, residual in units of the stated noise, and the sd
+    /// that members and noise give it \[mmHg\], with the innovation in that unit.
+    pub fn hear(&mut self, time_s: f64, phase: Option<f64>, residual: f64, sd: f64, innovation: f64) {
+        if !(residual.is_finite() && innovation.is_finite()) {
+            return;
+        }
+        self.variance = sd * sd;
+        if let Some(phase) = phase {
+            self.hear_phase(phase, innovation.clamp(-3.0, 3.0));
+        }
+        let mean = self.square.get_or_insert(innovation * innovation);
+        *mean += PUBLISHED_MEMORY * (innovation * innovation - *mean);
+        if let Some((before, _)) = self.last.filter(|(_, at)| time_s - at <= NEIGHBOURS_S && time_s > *at) {
+            let square = 0.5 * (residual - before) * (residual - before);
+            // Spikes are not noise.
+            let square = square.min(MAX_SQUARE * self.noise_square);
+            self.noise_square += (square - self.noise_square) / NOISE_MEMORY;
+        }
+        self.last = Some((residual, time_s));
+        for (block, length_s) in BLOCKS_S.into_iter().enumerate() {
+            let (start, sum, count) = &mut self.blocks[block];
+            let over = time_s - *start;
+            if over >= length_s && *count >= BLOCK_MIN || over > 10.0 * length_s {
+                self.close(block);
+                self.blocks[block] = (time_s, innovation, 1);
+            } else {
+                *sum += innovation;
+                *count += 1;
+            }
+        }
+    }
+
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    fn hear_phase(&mut self, phase: f64, innovation: f64) {
+        let now = ((phase * PHASES as f64) as usize).min(PHASES - 1);
+        if now < self.phase {
+            for phase in &mut self.phases {
+                phase.sum *= KEPT_PER_BEAT;
+                phase.weight *= KEPT_PER_BEAT;
+                phase.square_weight *= KEPT_PER_BEAT * KEPT_PER_BEAT;
+            }
+        }
+        self.phase = now;
+        let phase = &mut self.phases[now];
+        phase.sum += innovation;
+        phase.weight += 1.0;
+        phase.square_weight += 1.0;
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn close(&mut self, block: usize) {
+        let (_, sum, count) = self.blocks[block];
+        if count < BLOCK_MIN {
+            return;
+        }
+        let square = (sum * sum / count as f64).min(MAX_SQUARE);
+        let length_s = BLOCKS_S[block];
+        self.whiteness[block] += length_s / MEMORY_S[block] * (square - self.whiteness[block]);
+        let step = GAIN_PER_S[block] * length_s * (square - AIM);
+        let step = if self.whiteness() > ARMED { step } else { step.min(0.0) };
+        self.log_excess = (self.log_excess + step).clamp(0.0, self.max_log_excess);
+    }
+}

@@ -1,0 +1,88 @@
+//! Beat by beat: what clinicians read off a pressure curve, for every member, so that each figure has its band.
+
+use super::statistics::{Summary, summarise};
+use super::time::EventTime;
+use crate::model::{Extent, Model};
+
+/// A beat that is over.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BeatEstimate {
+    /// Its onset.
+    pub start: EventTime,
+    /// The onset of the next.
+    pub end: EventTime,
+    /// One per clinical quantity of the model.
+    pub values: Vec<Summary>,
+}
+
+/// Follows the members through a beat.
+#[derive(Debug, Clone, Default)]
+pub struct BeatFollower {
+    /// Time and beats counted by the clock of the ensemble, when last heard of.
+    last: Option<(EventTime, f64)>,
+    /// Onset of the beat under way \[s\]; None before the first onset seen.
+    onset_s: Option<f64>,
+    /// `[n_quantities x n_members]`; `mean` is the integral so far, `change` the value at the start.
+    extents: Vec<Extent>,
+}
+
+impl BeatFollower {
+    /// Takes in all members at one time, `[n_quantities x n_members]`, states first; `beats` is the clock of the ensemble.
+    /// Returns the beat that ended, if one did.
+    /// `theta` gives the parameters of a member.
+    pub fn follow<'t, M: Model>(
+        &mut self,
+        model: &M,
+        time: EventTime,
+        beats: f64,
+        values: &[f64],
+        theta: &dyn Fn(usize) -> &'t [f64],
+    ) -> Option<BeatEstimate> {
+        let (before, beats_before) = self.last.replace((time, beats))?;
+        let dt_s = time.as_s() - before.as_s();
+        let mut over = None;
+        if beats.floor() > beats_before.floor() {
+            // The onset lies between two windows; flows through the outlets are zero there.
+            let onset_s = time.as_s() - dt_s * (beats - beats.floor()) / (beats - beats_before);
+            over = self.onset_s.map(|start_s| self.read(model, (start_s, onset_s), values, theta));
+            self.onset_s = Some(onset_s);
+            self.extents.clear();
+            self.extents.extend(values.iter().map(|v| Extent { change: *v, ..Extent::EMPTY }));
+        }
+        for (extent, value) in self.extents.iter_mut().zip(values) {
+            extent.min = extent.min.min(*value);
+            extent.max = extent.max.max(*value);
+            extent.mean += value * dt_s;
+        }
+        over
+    }
+
+    fn read<'t, M: Model>(
+        &self,
+        model: &M,
+        (start_s, end_s): (f64, f64),
+        values: &[f64],
+        theta: &dyn Fn(usize) -> &'t [f64],
+    ) -> BeatEstimate {
+        let n_q = model.n_states() + model.derived().len();
+        let members = self.extents.len() / n_q;
+        let duration_s = end_s - start_s;
+        let mut read = vec![0.0; model.clinical().len() * members];
+        let mut row = vec![0.0; model.clinical().len()];
+        for i in 0..members {
+            let whole = |q: usize| {
+                let extent = self.extents[q * members + i];
+                Extent { mean: extent.mean / duration_s, change: values[q * members + i] - extent.change, ..extent }
+            };
+            let (states, derived): (Vec<_>, Vec<_>) =
+                ((0..model.n_states()).map(whole).collect(), (model.n_states()..n_q).map(whole).collect());
+            model.read_cycle(duration_s, theta(i), &states, &derived, &mut row);
+            row.iter().enumerate().for_each(|(k, value)| read[k * members + i] = *value);
+        }
+        BeatEstimate {
+            start: EventTime::from_s(start_s),
+            end: EventTime::from_s(end_s),
+            values: read.chunks_exact_mut(members).map(|v| summarise(v, 0.0, 0.0)).collect(),
+        }
+    }
+}

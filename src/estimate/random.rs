@@ -1,0 +1,126 @@
+//! Random numbers over the members, with the moments they ought to have.
+//!
+//! A hundred independent draws have a mean that is not zero and correlations that are not there: the noise that is
+//! added to the members in every window would feed both into the covariance of the ensemble, and the members would
+//! contract faster than the data allow. Here every row of draws is centred, has variance 1, and is orthogonal to the
+//! other rows and to the deviations of the members themselves (second-order exact sampling; Pham 2001, Hoteit et al.
+//! 2015). For a linear model the ensemble then has exactly the mean and covariance of the Kalman filter, whatever the
+//! number of members.
+
+use rand::Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+/// Rows over the members, as an orthonormal and centred set.
+#[derive(Debug, Clone, Default)]
+pub struct Directions {
+    members: usize,
+    rows: Vec<f64>,
+}
+
+impl Directions {
+    /// No direction yet.
+    #[must_use]
+    pub fn new(members: usize) -> Self {
+        Self { members, rows: Vec::new() }
+    }
+
+    /// Number of directions.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.rows.len().checked_div(self.members).unwrap_or(0)
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
+    /// Centres `row` `[n_members]` and takes the directions out of it; returns what is left of its length, as a share.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn reduce(&self, row: &mut [f64]) -> f64 {
+        let mean = row.iter().sum::<f64>() / self.members as f64;
+        row.iter_mut().for_each(|v| *v -= mean);
+        let before = length(row);
+        // Twice, because once is not orthogonal to rounding.
+        for direction in self.rows.chunks_exact(self.members).chain(self.rows.chunks_exact(self.members)) {
+            let along: f64 = direction.iter().zip(row.iter()).map(|(a, b)| a * b).sum();
+            row.iter_mut().zip(direction).for_each(|(r, d)| *r -= along * d);
+        }
+        if before > 0.0 { length(row) / before } else { 0.0 }
+    }
+
+    /// Adds what `row` has beyond the directions known; nothing if that is rounding.
+    pub fn add(&mut self, row: &[f64]) {
+        let mut rest = row.to_vec();
+        if self.reduce(&mut rest) > 1e-9 {
+            let length = length(&rest);
+            self.rows.extend(rest.iter().map(|r| r / length));
+        }
+    }
+
+    /// Projections of the centred `row` on the directions.
+    pub fn along<'a>(&'a self, row: &'a [f64]) -> impl Iterator<Item = f64> + 'a {
+        self.rows.chunks_exact(self.members.max(1)).map(move |d| d.iter().zip(row).map(|(a, b)| a * b).sum())
+    }
+}
+
+fn length(row: &[f64]) -> f64 {
+    row.iter().map(|v| v * v).sum::<f64>().sqrt()
+}
+
+/// `rows x members` standard normals, row-major: centred, of sample variance 1 and, where there are members enough,
+/// orthogonal to each other and to the rows of `against` `[any x members]`.
+#[allow(clippy::cast_precision_loss)]
+pub fn exact_normals<R: Rng>(rows: usize, members: usize, against: &[f64], rng: &mut R) -> Vec<f64> {
+    let mut taken = Directions::new(members);
+    // Few members have too few directions left to be random in.
+    let exact = members > 2 * (rows + against.len() / members.max(1)) + 1;
+    if exact {
+        against.chunks_exact(members).for_each(|row| taken.add(row));
+    }
+    let mut out = Vec::with_capacity(rows * members);
+    let target = (members as f64 - 1.0).max(1.0).sqrt();
+    for _ in 0..rows {
+        let mut row: Vec<f64> = (0..members).map(|_| StandardNormal.sample(rng)).collect();
+        taken.reduce(&mut row);
+        let length = length(&row);
+        if length > 0.0 {
+            row.iter_mut().for_each(|v| *v *= target / length);
+        }
+        if exact {
+            taken.add(&row);
+        }
+        out.extend(row);
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::exact_normals;
+
+    #[test]
+    fn draws_are_centred_of_variance_one_and_orthogonal_to_each_other_and_to_what_is_given() {
+        let (members, mut rng) = (30, ChaCha8Rng::seed_from_u64(5));
+        let given = exact_normals(3, members, &[], &mut rng);
+        let all: Vec<f64> = given.iter().copied().chain(exact_normals(4, members, &given, &mut rng)).collect();
+        for (i, a) in all.chunks_exact(members).enumerate() {
+            assert!(a.iter().sum::<f64>().abs() < 1e-12, "centred");
+            for (j, b) in all.chunks_exact(members).enumerate() {
+                let product: f64 = a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / 29.0;
+                let expected = if i == j { 1.0 } else { 0.0 };
+                assert!((product - expected).abs() < 1e-12, "{product} against {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn two_members_still_differ() {
+        let draws = exact_normals(2, 2, &[1.0, -1.0], &mut ChaCha8Rng::seed_from_u64(5));
+        assert!(draws.chunks_exact(2).all(|row| (row[0] + row[1]).abs() < 1e-12 && row[0].abs() > 0.1));
+    }
+}

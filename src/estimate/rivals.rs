@@ -1,0 +1,255 @@
+//! The filters that a user would reach for first, behind the interface of the ensemble: they forecast with a classical
+//! Runge-Kutta scheme, know each sensor's noise and a constant process noise, and correct linearly at the end of a
+//! window for all of its samples at once.
+
+use rand::Rng;
+
+use super::coupling::coupled::semidefinite_cholesky;
+use super::ensemble::{Ensemble, Observation, Parallel, WindowReport};
+use super::member::Member;
+use super::random::exact_normals;
+use super::statistics::{centred, mean_and_sd};
+use crate::model::Model;
+
+/// Unscented Kalman filter over (state, parameter coordinates): mean, covariance, and a standard normal cloud that
+/// stands for the posterior wherever members are asked for.
+#[derive(Debug, Clone)]
+pub(super) struct Unscented {
+    mean: Vec<f64>,
+    /// `[n x n]`
+    covariance: Vec<f64>,
+    /// `[n x n_members]`
+    cloud: Vec<f64>,
+    /// The sigma points, as members.
+    points: Vec<Member>,
+}
+
+impl Unscented {
+    /// With the moments of `rows` `[n x n_members]`.
+    pub(super) fn new<R: Rng>(rows: &[f64], members: usize, rng: &mut R) -> Self {
+        let n = rows.len() / members;
+        let mean: Vec<f64> = rows.chunks_exact(members).map(|row| mean_and_sd(row).0).collect();
+        let covariance = covariance(rows, rows, members);
+        Self { mean, covariance, cloud: exact_normals(n, members, &[], rng), points: Vec::new() }
+    }
+}
+
+/// `[n_a x n_b]` of rows over the members.
+#[allow(clippy::cast_precision_loss)]
+fn covariance(a: &[f64], b: &[f64], members: usize) -> Vec<f64> {
+    let (a, b): (Vec<_>, Vec<_>) =
+        (a.chunks_exact(members).map(centred).collect(), b.chunks_exact(members).map(centred).collect());
+    let degrees = members as f64 - 1.0;
+    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / degrees;
+    a.iter().flat_map(|a| b.iter().map(|b| product(a, b)).collect::<Vec<_>>()).collect()
+}
+
+/// `cross S^-1`, `[n x m]`; None if `S` is not definite.
+fn gain(cross: &[f64], innovation: &[f64], m: usize) -> Option<Vec<f64>> {
+    let mut factor = innovation.to_vec();
+    semidefinite_cholesky(&mut factor, m);
+    if (0..m).any(|i| !(factor[i * m + i] > 0.0)) {
+        return None;
+    }
+    let mut gain = cross.to_vec();
+    for row in gain.chunks_exact_mut(m) {
+        for i in 0..m {
+            let known: f64 = (0..i).map(|k| factor[i * m + k] * row[k]).sum();
+            row[i] = (row[i] - known) / factor[i * m + i];
+        }
+        for i in (0..m).rev() {
+            let known: f64 = (i + 1..m).map(|k| factor[k * m + i] * row[k]).sum();
+            row[i] = (row[i] - known) / factor[i * m + i];
+        }
+    }
+    Some(gain)
+}
+
+impl<M: Model> Ensemble<M> {
+    /// Forecast, then the stochastic update with perturbed observations.
+    pub(super) fn enkf_step(&mut self, observations: &[Observation], h: f64, parallel: &dyn Parallel) -> WindowReport {
+        self.wander_for(h);
+        let Self { model, settings, .. } = &*self;
+        let (model, settings) = (model.clone(), settings.clone());
+        parallel.for_each(&mut self.members, &|_, member| {
+            let end = member.forecast(&model, observations, &settings, h);
+            model.advance(h, &mut member.theta);
+            member.go(&model, h, &end);
+        });
+        let mut report = WindowReport { solved: self.len(), ..Default::default() };
+        if observations.is_empty() {
+            return report;
+        }
+        let members = self.len();
+        let (rows, sd) = (self.rows(), self.stated_noise(observations));
+        let expected: Vec<f64> =
+            (0..sd.len()).flat_map(|j| self.members.iter().map(move |member| member.expected[j])).collect();
+        let noise = exact_normals(sd.len(), members, &rows, &mut self.rng);
+        let m = sd.len();
+        let mut innovation = covariance(&expected, &expected, members);
+        (0..m).for_each(|j| innovation[j * m + j] += sd[j] * sd[j]);
+        report.innovations = (0..m)
+            .map(|j| {
+                let mean = mean_and_sd(&expected[j * members..][..members]).0;
+                (observations[j].value - mean) / innovation[j * m + j].sqrt()
+            })
+            .collect();
+        let before = self.coordinates();
+        if let Some(gain) = gain(&covariance(&rows, &expected, members), &innovation, m) {
+            let mut updated = rows;
+            for (row, gain) in updated.chunks_exact_mut(members).zip(gain.chunks_exact(m)) {
+                for (i, value) in row.iter_mut().enumerate() {
+                    let off =
+                        |j: usize| observations[j].value + sd[j] * noise[j * members + i] - expected[j * members + i];
+                    *value += (0..m).map(|j| gain[j] * off(j)).sum::<f64>();
+                }
+            }
+            self.place(&updated, h);
+        }
+        report.informed = self.compare(&before);
+        report
+    }
+
+    /// Sigma points, their forecast, and the update of the moments.
+    pub(super) fn ukf_step(&mut self, observations: &[Observation], h: f64) -> WindowReport {
+        let mut report = WindowReport { solved: self.len(), ..Default::default() };
+        let Some(mut filter) = self.unscented.take() else { return report };
+        let n = filter.mean.len();
+        self.disturb(&mut filter, h);
+        let before = self.coordinates();
+
+        let points = self.sigma_points(&mut filter, observations, h);
+        let m = observations.len();
+        let (ends, expected): (Vec<f64>, Vec<f64>) = {
+            let rows = self.rows_of(&filter.points);
+            (rows, (0..m).flat_map(|j| filter.points.iter().map(move |p| p.expected[j])).collect())
+        };
+        let moments = |a: &[f64], b: &[f64]| weighted_covariance(a, b, points);
+        filter.mean = ends.chunks_exact(points).map(weighted_mean).collect();
+        filter.covariance = moments(&ends, &ends);
+        if m > 0 {
+            let sd = self.stated_noise(observations);
+            let mut innovation = moments(&expected, &expected);
+            (0..m).for_each(|j| innovation[j * m + j] += sd[j] * sd[j]);
+            let off: Vec<f64> =
+                expected.chunks_exact(points).zip(observations).map(|(row, o)| o.value - weighted_mean(row)).collect();
+            report.innovations = (0..m).map(|j| off[j] / innovation[j * m + j].sqrt()).collect();
+            if let Some(gain) = gain(&moments(&ends, &expected), &innovation, m) {
+                for i in 0..n {
+                    let row = &gain[i * m..(i + 1) * m];
+                    filter.mean[i] += row.iter().zip(&off).map(|(k, v)| k * v).sum::<f64>();
+                    for j in 0..n {
+                        let other = &gain[j * m..(j + 1) * m];
+                        let seen: f64 = (0..m)
+                            .map(|a| (0..m).map(|b| row[a] * innovation[a * m + b] * other[b]).sum::<f64>())
+                            .sum();
+                        filter.covariance[i * n + j] -= seen;
+                    }
+                }
+            }
+        }
+        let clocks = filter.points[0].theta.clone();
+        self.draw_cloud(&filter, &clocks, h);
+        self.unscented = Some(filter);
+        if m > 0 {
+            report.informed = self.compare(&before);
+        }
+        report
+    }
+
+    /// Process noise of a step, and the pull of the parameters to where they started.
+    fn disturb(&self, filter: &mut Unscented, h: f64) {
+        let (n, states) = (filter.mean.len(), self.model.n_states());
+        for (s, sd) in self.settings.drift.states.iter().enumerate() {
+            filter.covariance[s * n + s] += sd * sd * h;
+        }
+        for (k, &p) in self.estimated().iter().enumerate() {
+            let (belief, i) = (&self.settings.beliefs[p], states + k);
+            let keep = (-belief.reversion * h).exp();
+            filter.mean[i] = self.centre[k] + keep * (filter.mean[i] - self.centre[k]);
+            for j in 0..n {
+                filter.covariance[i * n + j] *= keep;
+                filter.covariance[j * n + i] *= keep;
+            }
+            filter.covariance[i * n + i] +=
+                belief.drift * belief.drift * super::adapt::pace::diffusion(belief.reversion, h);
+        }
+    }
+
+    /// The symmetric set of `2 n` points at `sqrt(n)` sd, moved on to the end of the window; returns their number.
+    #[allow(clippy::cast_precision_loss)]
+    fn sigma_points(&self, filter: &mut Unscented, observations: &[Observation], h: f64) -> usize {
+        let (n, states) = (filter.mean.len(), self.model.n_states());
+        let mut root = filter.covariance.clone();
+        semidefinite_cholesky(&mut root, n);
+        let reach = (n as f64).sqrt();
+        let base = &self.members[0];
+        filter.points.resize_with(2 * n, || Member::new(None, base.x.clone(), base.theta.clone()));
+        for (i, point) in filter.points.iter_mut().enumerate() {
+            let (column, sign) = (i % n, if i < n { reach } else { -reach });
+            let at = |row: usize| filter.mean[row] + if column <= row { sign * root[row * n + column] } else { 0.0 };
+            point.x.iter_mut().enumerate().for_each(|(s, x)| *x = at(s));
+            point.theta.clone_from(&base.theta);
+            for (k, &p) in self.estimated().iter().enumerate() {
+                point.theta[p] = self.settings.beliefs[p].value(self.transforms[k], at(states + k));
+            }
+            let end = point.forecast(&self.model, observations, &self.settings, h);
+            point.x.clone_from(&end);
+            self.model.advance(h, &mut point.theta);
+        }
+        2 * n
+    }
+
+    /// Members with the moments of the filter.
+    fn draw_cloud(&mut self, filter: &Unscented, clocks: &[f64], h: f64) {
+        let (n, members) = (filter.mean.len(), self.len());
+        let mut root = filter.covariance.clone();
+        semidefinite_cholesky(&mut root, n);
+        let mut rows = Vec::with_capacity(n * members);
+        for i in 0..n {
+            for member in 0..members {
+                let along: f64 = (0..=i).map(|k| root[i * n + k] * filter.cloud[k * members + member]).sum();
+                rows.push(filter.mean[i] + along);
+            }
+        }
+        for member in &mut self.members {
+            member.theta.copy_from_slice(clocks);
+            let end = member.x.clone();
+            member.go(&self.model, h, &end);
+        }
+        self.place(&rows, h);
+    }
+
+    /// Sets states and parameters at the end of the window from `rows` `[n_u x n_members]`.
+    fn place(&mut self, rows: &[f64], h: f64) {
+        let (members, n) = (self.len(), self.model.n_states());
+        for (i, member) in self.members.iter_mut().enumerate() {
+            for s in 0..n {
+                member.x[s] = rows[s * members + i];
+                member.solution.end[s] = member.x[s];
+            }
+            for (k, &p) in self.estimated.iter().enumerate() {
+                let u = rows[(n + k) * members + i];
+                member.theta[p] = self.settings.beliefs[p].value(self.transforms[k], u);
+            }
+            member.solution.theta.clone_from(&member.theta);
+            self.model.advance(-h, &mut member.solution.theta);
+        }
+    }
+
+    fn stated_noise(&self, observations: &[Observation]) -> Vec<f64> {
+        observations.iter().map(|o| self.settings.channels[o.channel].noise_sd_mmhg).collect()
+    }
+}
+
+#[allow(clippy::cast_precision_loss)]
+fn weighted_mean(row: &[f64]) -> f64 {
+    row.iter().sum::<f64>() / row.len() as f64
+}
+
+#[allow(clippy::cast_precision_loss)]
+fn weighted_covariance(a: &[f64], b: &[f64], points: usize) -> Vec<f64> {
+    // All weights are equal, and the points are all there is: divided by their number.
+    let share = (points as f64 - 1.0) / points as f64;
+    covariance(a, b, points).into_iter().map(|c| share * c).collect()
+}
