@@ -142,7 +142,7 @@ impl Run {
         for output in self.outputs.drain(..) {
             match output {
                 Output::Estimate(estimate) => self.table.row(&estimate_row(&estimate))?,
-                Output::Beat(_) => {}
+                Output::Beat(_) | Output::Smoothed(_) => {}
                 Output::Window(window) => {
                     self.windows += 1;
                     self.iterations += window.report.iterations as u64;

@@ -188,7 +188,7 @@ impl Sink for Outlet {
             match output {
                 Output::Estimate(estimate) => self.estimate(bed, estimate),
                 Output::Notice(notice) => self.notice(&bed.name, &channels, notice),
-                Output::Beat(_) | Output::Window(_) => {}
+                Output::Smoothed(_) | Output::Beat(_) | Output::Window(_) => {}
             }
         }
         if let Some(health) = health {

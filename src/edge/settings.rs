@@ -2,10 +2,12 @@
 
 use super::config::{self, Config, ConfigError, DiscrepancyForm, DiscrepancySettings};
 use crate::estimate::settings::{
-    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
+    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, LiveSettings, RowWeights,
+    WindowSettings,
 };
 use crate::estimate::time::ns_from_s;
-use crate::model::cvsim6::{PARAMETERS, Pressures};
+use crate::estimate::timing::TimingSource;
+use crate::model::cvsim6::{PARAMETERS, Pressures, State};
 use crate::model::discrepancy::{Circulation, Discrepancy, Discrepant, Form};
 use crate::model::{Model, ParameterInfo};
 use crate::xtfc::features::{Activation, FeatureSpec, Nodes, WeightDistribution};
@@ -153,6 +155,21 @@ impl Config {
             stopping: Stopping { max_iterations: estimator.max_iterations, tolerance_mmhg: estimator.tolerance },
             channels: self.observed_channels(),
             aleatoric_sd_mmhg: with(self.channels.iter().map(|(_, c)| c.noise_sd).collect(), &|_| 0.0),
+            live: LiveSettings {
+                timing: match estimator.timing {
+                    config::Timing::Config => TimingSource::Clock,
+                    config::Timing::Beats => TimingSource::Told,
+                    config::Timing::Tracked => TimingSource::Found,
+                },
+                timing_channels: self.timing_channels(),
+                screen_artefacts: estimator.screen_artefacts,
+                smoothing_lag_ns: ns_from_s(estimator.smoothing_lag_s),
+                second_opinion: match estimator.second_opinion {
+                    config::SecondOpinion::None => None,
+                    config::SecondOpinion::Ukf => Some(CouplingKind::Ukf),
+                    config::SecondOpinion::Enkf => Some(CouplingKind::Enkf),
+                },
+            },
             publish_period_ns: ns_from_s(1.0 / self.publish.rate_hz),
         })
     }
@@ -181,6 +198,13 @@ impl Config {
     #[must_use]
     pub fn observed_states(&self) -> Vec<usize> {
         (0..Pressures::LEN).filter(|&i| self.observed.iter().any(|o| o == Pressures::NAMES[i])).collect()
+    }
+
+    /// Observed channels in which beats show, the clearest first: arteries, ventricles.
+    fn timing_channels(&self) -> Vec<usize> {
+        let observed = self.observed_states();
+        let clearest = [State::A, State::L, State::Pa, State::R].map(|state| state as usize);
+        clearest.iter().filter_map(|state| observed.iter().position(|o| o == state)).collect()
     }
 
     fn observed_channels(&self) -> Vec<ChannelSettings> {

@@ -13,7 +13,10 @@ pub use super::member::Member;
 use super::random::exact_normals;
 use super::rivals::Unscented;
 use super::settings::{CouplingKind, EstimatorSettings, SettingsError};
+use super::smoother::{Correction, Remembered, Smoother};
 use super::statistics::{Explainers, Summary, mean_and_sd, summarise};
+use super::time::EventTime;
+use super::timing::{ClockEdit, WAITING_PHASE};
 use crate::model::{Cycle, Model, Transform};
 use crate::xtfc::basis::Basis;
 use crate::xtfc::features::{FeatureError, RandomFeatures};
@@ -22,12 +25,25 @@ use crate::xtfc::problem::{Solution, Unknowns};
 /// A share of the prior variance that counts as learnt.
 const INFORMED: f64 = 1e-4;
 
+/// A parameter is identifiable when data have halved the sd it started with.
+const IDENTIFIABLE: f64 = 0.75;
+
 /// Longest time between two steps of what wanders \[s\].
 const WANDER_S: f64 = 0.02;
 
 /// Spacing of the checkpoints \[s\], and how many are kept.
 const CHECKPOINT_S: f64 = 0.1;
-const CHECKPOINTS: usize = 4;
+const CHECKPOINTS: usize = 8;
+
+/// How far a second look goes back when a parameter has begun to move \[s\].
+const LOOK_BACK_S: f64 = 0.4;
+
+/// Longest time over which a clock that could not be corrected in time is set forth \[s\].
+const MAX_CLOCK_S: f64 = 2.0;
+
+/// Spread of heart rate (relative) and phase (beats) after an onset has set them.
+const RATE_SD: f64 = 0.03;
+const PHASE_SD: f64 = 0.01;
 
 /// Draws of a member's features before they are given up.
 const MAX_REDRAWS: usize = 100;
@@ -84,6 +100,10 @@ pub struct WindowReport {
     pub physics_rms: f64,
     /// Normalised innovation of each observation: (observed - forecast) over the sd that members and noise give it.
     pub innovations: Vec<f64>,
+    /// What the members expected of each observation, on average \[mmHg\].
+    pub expected: Vec<f64>,
+    /// Estimated parameters, by their position among them, that have begun to move.
+    pub moving: Vec<usize>,
     /// Whether the window had data that said something about each estimated parameter.
     pub informed: Vec<bool>,
 }
@@ -94,8 +114,11 @@ struct Checkpoint {
     /// States and parameters.
     members: Vec<(Vec<f64>, Vec<f64>)>,
     fits: Vec<ChannelFit>,
+    paces: Vec<Pace>,
     wander_due_s: f64,
     elapsed_s: f64,
+    window: u64,
+    clock_waits: bool,
 }
 
 /// The last moments, to be looked at again.
@@ -123,18 +146,21 @@ impl Memory {
         }
     }
 
-    /// The oldest checkpoint and all windows since; forgets everything.
-    fn rewind(&mut self) -> Option<(Checkpoint, Vec<Vec<Observation>>)> {
-        let (oldest, _) = self.checkpoints.pop_front()?;
-        let mut windows: Vec<_> = self.checkpoints.drain(..).flat_map(|(_, windows)| windows).collect();
+    /// The last checkpoint before `from_s`, or the oldest, and all windows since, which are forgotten.
+    fn rewind(&mut self, from_s: f64) -> Option<(Checkpoint, Vec<Vec<Observation>>)> {
+        let before = self.checkpoints.iter().rposition(|(checkpoint, _)| checkpoint.elapsed_s <= from_s).unwrap_or(0);
+        let (checkpoint, _) = self.checkpoints.get(before)?.clone();
+        let mut windows: Vec<_> = self.checkpoints.drain(before + 1..).flat_map(|(_, windows)| windows).collect();
         windows.append(&mut self.since);
-        Some((oldest, windows))
+        Some((checkpoint, windows))
     }
 }
 
 /// Samples of a window against what the members expect.
 #[derive(Debug, Clone, Default)]
 struct Judged {
+    /// Mean of what the members expect \[mmHg\].
+    expected: Vec<f64>,
     /// Noise that each is taken to have \[mmHg\].
     sd: Vec<f64>,
     /// Observed minus expected, in units of the stated noise.
@@ -171,7 +197,17 @@ pub struct Ensemble<M> {
     wander_due_s: f64,
     pub(super) unscented: Option<Unscented>,
     memory: Memory,
-    second_look: bool,
+    /// First window that is being solved again.
+    second_look: Option<u64>,
+    hears_again: bool,
+    smoother: Smoother,
+    /// Windows solved.
+    window: u64,
+    listening: bool,
+    held: bool,
+    clock_waits: bool,
+    /// When on the clock of `elapsed_s`, and what; in order of time.
+    edits: Vec<(f64, ClockEdit)>,
 }
 
 impl<M: Model> Ensemble<M> {
@@ -235,7 +271,14 @@ impl<M: Model> Ensemble<M> {
             wander_due_s: 0.0,
             unscented: None,
             memory: Memory::default(),
-            second_look: false,
+            second_look: None,
+            hears_again: false,
+            smoother: Smoother::default(),
+            window: 0,
+            listening: true,
+            held: false,
+            clock_waits: false,
+            edits: Vec::new(),
         };
         ensemble.initial_sd = (0..ensemble.estimated.len()).map(|k| ensemble.coordinate(k).1).collect();
         if ensemble.settings.coupling == CouplingKind::Ukf {
@@ -288,42 +331,238 @@ impl<M: Model> Ensemble<M> {
             CouplingKind::Enkf => self.enkf_step(observations, h, parallel),
             CouplingKind::Ukf => self.ukf_step(observations, h),
         };
-        self.elapsed_s += h;
+        if self.settings.coupling != CouplingKind::Coupled {
+            self.elapsed_s += h;
+            self.window += 1;
+        }
         report
     }
 
     /// One window, and a second look at the last few if a parameter has begun to move in them.
     fn coupled_step(&mut self, observations: &[Observation], h: f64, parallel: &dyn Parallel) -> WindowReport {
-        let mut report = self.first_look(observations, h, parallel);
-        if self.settings.adaptation.pace {
-            let mut moving = false;
-            for pace in &mut self.paces {
-                moving |= pace.advance(h);
-            }
-            self.memory.note(observations);
-            if moving && let Some((checkpoint, windows)) = self.memory.rewind() {
-                self.restore(&checkpoint);
-                for window in &windows {
-                    self.second_look = true;
-                    report = WindowReport { informed: report.informed, ..self.first_look(window, h, parallel) };
-                    self.elapsed_s += h;
+        let mut report = self.look(observations, h, parallel);
+        if self.settings.adaptation.pace && self.listening {
+            let clocks: Vec<usize> = (0..self.estimated.len()).filter(|k| self.is_clock(*k)).collect();
+            for (k, pace) in self.paces.iter_mut().enumerate() {
+                if pace.advance(h) && !clocks.contains(&k) {
+                    report.moving.push(k);
                 }
-                self.elapsed_s -= h;
-                self.second_look = false;
             }
-            if self.memory.is_due(h) {
-                self.memory.keep(self.checkpoint());
+            if !report.moving.is_empty() {
+                self.look_again(self.elapsed_s - LOOK_BACK_S, false, parallel);
             }
         }
         report
+    }
+
+    /// Whether an estimated parameter is part of the clock. Its phase moves by itself, which is no pace of its own, and its
+    /// rate is heard of once in a beat only: what is larger than their drift is left to those who listen for beats.
+    fn is_clock(&self, k: usize) -> bool {
+        let p = self.estimated[k];
+        self.model.cycle().is_some_and(|cycle| cycle.phase == p || cycle.rate == p)
+    }
+
+    /// One window, remembered.
+    fn look(&mut self, observations: &[Observation], h: f64, parallel: &dyn Parallel) -> WindowReport {
+        let report = self.first_look(observations, h, parallel);
+        self.elapsed_s += h;
+        self.window += 1;
+        self.memory.note(observations);
+        if self.memory.is_due(h) {
+            self.memory.keep(self.checkpoint());
+        }
+        report
+    }
+
+    /// Solves the windows since `from_s` (on the clock of `elapsed_s`) again, as far back as they are remembered.
+    /// With `doubt`, what was learnt of the paces in them is forgotten and learnt anew.
+    fn look_again(&mut self, from_s: f64, doubt: bool, parallel: &dyn Parallel) {
+        // A parameter that seems to move may turn out to be a beat that came early, so the first impression is kept.
+        let before = (!doubt).then(|| self.memory.clone());
+        let Some((checkpoint, windows)) = self.memory.rewind(from_s) else { return };
+        let h = self.settings.window.length_s();
+        self.restore(&checkpoint);
+        if doubt {
+            self.paces.clone_from(&checkpoint.paces);
+        }
+        self.second_look = Some(self.window);
+        self.hears_again = doubt;
+        for window in &windows {
+            self.look(window, h, parallel);
+            if doubt && self.settings.adaptation.pace && self.listening {
+                self.paces.iter_mut().for_each(|pace| _ = pace.advance(h));
+            }
+            let last = self.window - 1;
+            let mut smoother = std::mem::take(&mut self.smoother);
+            smoother.in_window(last).for_each(|moment| self.fill(moment));
+            self.smoother = smoother;
+        }
+        if let Some(before) = before {
+            self.memory = before;
+        }
+        self.second_look = None;
+        self.hears_again = false;
+    }
+
+    /// Sets the clocks of the members; `now_s` is the event time at the end of the last window.
+    pub fn edit_clocks(&mut self, edits: &[ClockEdit], now_s: f64, parallel: &dyn Parallel) {
+        let ago = |edit: &ClockEdit| match *edit {
+            ClockEdit::Beat { at_s, .. } => now_s - at_s,
+            ClockEdit::Wait { from_s } => now_s - from_s,
+            ClockEdit::GoOn => 0.0,
+        };
+        self.edits = edits.iter().map(|edit| (self.elapsed_s - ago(edit), *edit)).collect();
+        if let Some((earliest, _)) = self.edits.first() {
+            // Before the clock went wrong, parameters had no reason to move: their paces start again from there, too.
+            self.look_again(*earliest, true, parallel);
+        }
+        // What lies in the present, or could not be remembered.
+        let h = self.settings.window.length_s();
+        self.apply_edits(f64::INFINITY, self.elapsed_s - h);
+        if !self.listening {
+            self.spread_anew();
+        }
+    }
+
+    /// Gives the states the spread that they started with: they have run by a wrong clock.
+    fn spread_anew(&mut self) {
+        let (n, m) = (self.model.n_states(), self.members.len());
+        let draws = exact_normals(n, m, &self.rows(), &mut self.rng);
+        for (s, row) in draws.chunks_exact(m).enumerate() {
+            let sd = self.settings.initial_state_sd[s];
+            self.members.iter_mut().zip(row).for_each(|(member, e)| member.x[s] += sd * e);
+        }
+    }
+
+    /// Applies what falls before `until_s`; clocks stand at `start_s`.
+    fn apply_edits(&mut self, until_s: f64, start_s: f64) {
+        while let Some((at_s, edit)) = self.edits.first().copied().filter(|(at_s, _)| *at_s < until_s) {
+            self.edits.remove(0);
+            match edit {
+                ClockEdit::Beat { rate, .. } => self.begin_beat(at_s.max(start_s - MAX_CLOCK_S) - start_s, rate),
+                ClockEdit::Wait { .. } => {
+                    self.clock_waits = true;
+                    self.shift_clocks(|beats| beats.round() - 1.0 + WAITING_PHASE);
+                }
+                ClockEdit::GoOn => self.clock_waits = false,
+            }
+        }
+    }
+
+    /// A beat begins `ahead_s` from where the clocks stand.
+    fn begin_beat(&mut self, ahead_s: f64, rate: Option<f64>) {
+        let Some(cycle) = self.model.cycle() else { return };
+        self.clock_waits = false;
+        let m = self.members.len();
+        let known = !self.estimated.contains(&cycle.rate);
+        let draws = exact_normals(2, m, &self.rows(), &mut self.rng);
+        if let Some(rate) = rate {
+            let (low, high) = self.settings.beliefs[cycle.rate].bounds;
+            for (member, e) in self.members.iter_mut().zip(&draws[..m]) {
+                let sd = if known { 0.0 } else { RATE_SD };
+                member.theta[cycle.rate] = (rate * (sd * e).exp()).clamp(low, high);
+            }
+        }
+        let per_s = self.rate_hz().unwrap_or(0.0);
+        self.shift_clocks(|beats| (beats + ahead_s * per_s).round() - ahead_s * per_s);
+        if !known {
+            for (member, e) in self.members.iter_mut().zip(&draws[m..]) {
+                let phase = member.theta[cycle.phase] + PHASE_SD * e;
+                self.model.set_clock(phase, &mut member.x, &mut member.theta);
+            }
+        }
+    }
+
+    /// Moves all clocks alike, their mean to where `to` says.
+    fn shift_clocks(&mut self, to: impl Fn(f64) -> f64) {
+        let (Some(cycle), Some(beats)) = (self.model.cycle(), self.cycles()) else { return };
+        let shift = to(beats) - beats;
+        for member in &mut self.members {
+            let phase = member.theta[cycle.phase] + shift;
+            self.model.set_clock(phase, &mut member.x, &mut member.theta);
+        }
+    }
+
+    /// Whether parameters stay as they are, but for the phase of the clock.
+    pub fn hold_parameters(&mut self, hold: bool) {
+        self.held = hold;
+    }
+
+    /// Whether samples are learnt from; otherwise they are only compared with what is expected.
+    pub fn listen(&mut self, listening: bool) {
+        self.listening = listening;
+    }
+
+    /// Mean rate of the cycles \[1/s\].
+    #[allow(clippy::cast_precision_loss)]
+    pub fn rate_hz(&self) -> Option<f64> {
+        let rate = self.model.cycle()?.rate;
+        Some(self.members.iter().map(|member| member.theta[rate]).sum::<f64>() / self.members.len() as f64 / 60.0)
+    }
+
+    /// Keeps the members at position `s` of the last window, to be corrected by what comes.
+    pub fn remember(&mut self, time: EventTime, s: f64) {
+        let mut moment = Remembered { time, window: self.window - 1, s, rows: Vec::new(), theta: Vec::new() };
+        self.fill(&mut moment);
+        self.smoother.remember(moment);
+    }
+
+    /// The members at a moment of the last window.
+    fn fill(&self, moment: &mut Remembered) {
+        let (n, m) = (self.model.n_states(), self.members.len());
+        moment.rows.clear();
+        moment.rows.resize((n + self.estimated.len()) * m, 0.0);
+        let mut x = vec![0.0; n];
+        let mut phi = Vec::new();
+        let ahead_s = moment.s * self.settings.window.length_s();
+        for (i, member) in self.members.iter().enumerate() {
+            member.state_at(&self.model, moment.s, &mut phi, &mut x);
+            x.iter().enumerate().for_each(|(s, x)| moment.rows[s * m + i] = *x);
+            let mut theta = member.solution.theta.clone();
+            self.model.advance(ahead_s, &mut theta);
+            for (k, &p) in self.estimated.iter().enumerate() {
+                moment.rows[(n + k) * m + i] = self.transforms[k].forward(theta[p]);
+            }
+            if i == 0 {
+                moment.theta = theta;
+            }
+        }
+    }
+
+    /// The oldest remembered moment that is not after `until`: its time, a summary per quantity and per parameter.
+    pub fn smoothed(&mut self, until: EventTime) -> Option<(EventTime, Vec<Summary>, Vec<ParameterSummary>)> {
+        let moment = self.smoother.release(until)?;
+        let (n, m) = (self.model.n_states(), self.members.len());
+        let n_d = self.model.derived().len();
+        let mut values = vec![0.0; (n + n_d) * m];
+        let mut parameters = vec![0.0; self.estimated.len() * m];
+        let (mut x, mut derived, mut theta) = (vec![0.0; n], vec![0.0; n_d], moment.theta.clone());
+        for i in 0..m {
+            x.iter_mut().enumerate().for_each(|(s, x)| *x = moment.rows[s * m + i]);
+            for (k, &p) in self.estimated.iter().enumerate() {
+                theta[p] = self.settings.beliefs[p].value(self.transforms[k], moment.rows[(n + k) * m + i]);
+                parameters[k * m + i] = theta[p];
+            }
+            self.model.derive(0.0, &x, &theta, &mut derived);
+            x.iter().chain(&derived).enumerate().for_each(|(q, value)| values[q * m + i] = *value);
+        }
+        let summaries = parameters.chunks_exact_mut(m).enumerate().map(|(k, row)| {
+            let coordinates: Vec<f64> = row.iter().map(|v| self.transforms[k].forward(*v)).collect();
+            self.parameter_summary(k, row, mean_and_sd(&coordinates).1)
+        });
+        let summaries = summaries.collect();
+        Some((moment.time, self.summarise(&mut values), summaries))
     }
 
     fn checkpoint(&self) -> Checkpoint {
         Checkpoint {
             members: self.members.iter().map(|member| (member.x.clone(), member.theta.clone())).collect(),
             fits: self.fits.clone(),
+            paces: self.paces.clone(),
             wander_due_s: self.wander_due_s,
             elapsed_s: self.elapsed_s,
+            window: self.window,
+            clock_waits: self.clock_waits,
         }
     }
 
@@ -335,9 +574,12 @@ impl<M: Model> Ensemble<M> {
         self.fits.clone_from(&checkpoint.fits);
         self.wander_due_s = checkpoint.wander_due_s;
         self.elapsed_s = checkpoint.elapsed_s;
+        self.window = checkpoint.window;
+        self.clock_waits = checkpoint.clock_waits;
     }
 
     fn first_look(&mut self, observations: &[Observation], h: f64, parallel: &dyn Parallel) -> WindowReport {
+        self.apply_edits(self.elapsed_s + h, self.elapsed_s);
         self.wander_due_s += h;
         // Between samples a little at a time is enough.
         if !observations.is_empty() || self.wander_due_s >= WANDER_S {
@@ -349,18 +591,28 @@ impl<M: Model> Ensemble<M> {
         parallel.for_each(&mut self.members, &|_, member| {
             member.forecast(&self.model, observations, &self.settings, 0.0);
         });
-        let rows = self.rows();
         let judged = self.judge(observations);
+        if !self.listening {
+            let report = self.learn(&[], &[], &[], parallel);
+            return WindowReport { innovations: judged.innovations, expected: judged.expected, ..report };
+        }
+        let rows = self.rows();
         let noise = exact_normals(observations.len(), self.members.len(), &rows, &mut self.rng);
         coupled::covariance_root(&rows, self.members.len(), &mut self.root);
         let inflation = self.settings.drift.inflation.powf(h);
         if inflation > 1.0 {
             self.root.iter_mut().for_each(|r| *r *= inflation.sqrt());
         }
+        if self.held {
+            self.fix_parameters();
+        }
+        if self.settings.live.smoothing_lag_ns > 0 {
+            self.correct_the_past(observations, &judged.sd, &noise);
+        }
         let report = self.learn(observations, &judged.sd, &noise, parallel);
         // Clocks stand at the end of the window by now.
         let clock = self.model.cycle().zip(self.cycles());
-        for (j, o) in observations.iter().enumerate() {
+        for (j, o) in observations.iter().enumerate().filter(|_| !self.held) {
             let phase = clock.map(|(cycle, cycles)| {
                 let rate = self.members[0].theta[cycle.rate] / 60.0;
                 (cycles - (1.0 - o.s) * h * rate).rem_euclid(1.0)
@@ -368,7 +620,32 @@ impl<M: Model> Ensemble<M> {
             let (residual, innovation) = (judged.residuals[j], judged.innovations[j]);
             self.fits[o.channel].hear(self.elapsed_s + o.s * h, phase, residual, judged.expected_sd[j], innovation);
         }
-        WindowReport { innovations: judged.innovations, ..report }
+        WindowReport { innovations: judged.innovations, expected: judged.expected, ..report }
+    }
+
+    /// Takes the parameters out of what a window can move, but for the phase of the clock.
+    fn fix_parameters(&mut self) {
+        let (n, n_u) = (self.model.n_states(), self.unknowns.len(self.model.n_states()));
+        let phase = self.model.cycle().map(|cycle| cycle.phase);
+        for (k, _) in self.estimated.iter().enumerate().filter(|(_, p)| Some(**p) != phase) {
+            self.root[(n + k) * n_u..(n + k + 1) * n_u].fill(0.0);
+        }
+    }
+
+    fn correct_the_past(&mut self, observations: &[Observation], sd: &[f64], noise: &[f64]) {
+        let m = self.members.len();
+        let expected: Vec<f64> =
+            (0..sd.len()).flat_map(|j| self.members.iter().map(move |member| member.expected[j])).collect();
+        let off: Vec<f64> = expected
+            .iter()
+            .zip(noise)
+            .enumerate()
+            .map(|(k, (expected, e))| observations[k / m].value + sd[k / m] * e - expected)
+            .collect();
+        if let Some(correction) = Correction::new(&expected, &off, sd, m) {
+            // What is looked at again has corrected the times before it already.
+            self.smoother.correct(&correction, self.second_look.unwrap_or(0));
+        }
     }
 
     /// One window of X-TFC for every member, with what it says of the parameters.
@@ -399,7 +676,8 @@ impl<M: Model> Ensemble<M> {
         let after = self.coordinates();
         let pairs = before.iter().zip(&after);
         // What is looked at again was heard before.
-        let listening = if self.second_look { 0 } else { self.paces.len() };
+        let listening =
+            if self.held || (self.second_look.is_some() && !self.hears_again) { 0 } else { self.paces.len() };
         for (pace, ((mean, sd), (new_mean, new_sd))) in self.paces.iter_mut().take(listening).zip(pairs.clone()) {
             pace.hear((*mean, *new_mean), (sd * sd, new_sd * new_sd));
         }
@@ -421,6 +699,7 @@ impl<M: Model> Ensemble<M> {
             let far = innovation.abs() / self.settings.adaptation.outlier_sd;
             judged.sd.push(if far > 1.0 { noise * far.sqrt() } else { noise });
             judged.residuals.push((o.value - mean) / stated);
+            judged.expected.push(mean);
             judged.expected_sd.push(expected_sd);
             judged.innovations.push(innovation);
         }
@@ -453,7 +732,8 @@ impl<M: Model> Ensemble<M> {
             .enumerate()
             .map(|(k, &p)| {
                 let belief = &self.settings.beliefs[p];
-                let pace = if adaptive { self.paces[k].now() } else { belief.drift };
+                let learnt = adaptive && !self.is_clock(k);
+                let pace = if learnt { self.paces[k].now() } else { belief.drift };
                 (k, (-belief.reversion * dt).exp(), pace * diffusion(belief.reversion, dt).sqrt())
             })
             .filter(|(_, keep, sd)| *sd > 0.0 || *keep < 1.0)
@@ -499,6 +779,7 @@ impl<M: Model> Ensemble<M> {
         let h = self.settings.window.length_s();
         let mut squares = 0.0;
         for member in &mut self.members {
+            let h = if self.clock_waits { 0.0 } else { h };
             if !member.solved {
                 self.model.advance(h, &mut member.theta);
                 continue;
@@ -610,8 +891,12 @@ impl<M: Model> Ensemble<M> {
 
     /// One summary per quantity of [`Ensemble::snapshot`].
     pub fn summarise_at(&self, s: f64, scratch: &mut Snapshot) -> Vec<Summary> {
+        self.summarise(self.snapshot(s, scratch))
+    }
+
+    /// One summary per row of `values` `[n_quantities x n_members]`, states first.
+    fn summarise(&self, values: &mut [f64]) -> Vec<Summary> {
         let (n, m) = (self.model.n_states(), self.members.len());
-        let values = self.snapshot(s, scratch);
         let explainers = Explainers::new(&values[(n - self.model.n_discrepancies()) * m..n * m], m);
         let noise = |q: usize| self.settings.aleatoric_sd_mmhg.get(q).copied().unwrap_or(0.0);
         let systematic = |q: usize| {
@@ -634,14 +919,18 @@ impl<M: Model> Ensemble<M> {
     pub fn summarise_parameters(&self) -> Vec<ParameterSummary> {
         let summary = |(k, &p): (usize, &usize)| {
             let mut values: Vec<f64> = self.members.iter().map(|member| member.theta[p]).collect();
-            let share = self.coordinate(k).1 / self.initial_sd[k];
-            ParameterSummary {
-                parameter: p,
-                summary: summarise(&mut values, 0.0, 0.0),
-                identifiability: if share.is_finite() { (1.0 - share * share).clamp(0.0, 1.0) } else { 0.0 },
-            }
+            self.parameter_summary(k, &mut values, self.coordinate(k).1)
         };
         self.estimated.iter().enumerate().map(summary).collect()
+    }
+
+    fn parameter_summary(&self, k: usize, values: &mut [f64], coordinate_sd: f64) -> ParameterSummary {
+        let share = coordinate_sd / self.initial_sd[k];
+        ParameterSummary {
+            parameter: self.estimated[k],
+            summary: summarise(values, 0.0, 0.0),
+            identifiability: if share.is_finite() { (1.0 - share * share).clamp(0.0, 1.0) } else { 0.0 },
+        }
     }
 
     /// States and estimated parameters of every member at the end of the last window,
@@ -663,6 +952,14 @@ pub struct ParameterSummary {
     pub summary: Summary,
     /// Share of the starting variance (of its coordinate) that data have removed: 0 nothing, 1 all.
     pub identifiability: f64,
+}
+
+impl ParameterSummary {
+    /// Whether the data say so much about it that its value is theirs rather than that of the settings.
+    #[must_use]
+    pub fn is_identifiable(&self) -> bool {
+        self.identifiability >= IDENTIFIABLE
+    }
 }
 
 /// Scratch of [`Ensemble::summarise_at`].

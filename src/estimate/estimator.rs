@@ -10,13 +10,21 @@ use super::ensemble::{
     Ensemble, Observation, Parallel, ParameterSummary, Serial, Snapshot, WindowReport, with_companions,
 };
 use super::settings::{EstimatorSettings, SettingsError};
+use super::signal::quality::{Artefact, Change, Quality, QualitySettings};
 use super::statistics::Summary;
 use super::time::{ArrivalTime, EventTime, NS_PER_S};
+use super::timing::{BeatTracker, ClockReading, Heard, TimingSource};
 use super::window::{ClosedWindow, Ingested, Liveness, RawSample, Refusal, WindowCutter};
 use crate::model::Model;
 
 /// A cause of refusal is reported as an event at most this often per channel \[ns of arrival time\].
 pub const REPORT_EVERY_NS: i64 = 10 * NS_PER_S;
+
+/// How long a model must not fit, or fit again, before it is said \[ns\].
+const MISFIT_NS: i64 = 2 * NS_PER_S;
+
+/// Beats told ahead of the windows that are kept.
+const MAX_TOLD: usize = 1024;
 
 /// Weight of the newest innovation in the running mean square.
 const INNOVATION_WEIGHT: f64 = 0.005;
@@ -35,6 +43,8 @@ pub enum Input {
     Tick,
     /// No more samples will come: close what was delivered.
     End,
+    /// Beats began at these times, says somebody who knows (an ECG).
+    Beats(Vec<EventTime>),
     /// Whether the whole ensemble is to be put out with every estimate.
     WantMembers(bool),
 }
@@ -44,6 +54,8 @@ pub enum Input {
 pub enum Output {
     /// An estimate at a published time.
     Estimate(Estimate),
+    /// An estimate at a published time, corrected by what came in the smoothing lag after it.
+    Smoothed(Estimate),
     /// A heart beat is over.
     Beat(BeatEstimate),
     /// A window was solved.
@@ -112,6 +124,22 @@ pub enum NoticeKind {
     MembersReplaced(usize),
     /// No member of a window could be solved; the ensemble stays where it was.
     WindowFailed,
+    /// A sensor is disturbed and set aside.
+    Artefact(Artefact),
+    /// A sensor is taken back.
+    ArtefactOver,
+    /// What a channel reads is no longer what the model says, beat after beat.
+    Misfit,
+    /// The model fits a channel again.
+    FitsAgain,
+    /// An estimated parameter, by its index in the model, has begun to move.
+    ParameterShift(usize),
+    /// The beat was found.
+    BeatFound,
+    /// No beat came when one was due.
+    BeatMissed,
+    /// A beat came at an unexpected time.
+    BeatUnexpected,
 }
 
 impl NoticeKind {
@@ -126,6 +154,14 @@ impl NoticeKind {
             Self::Restart => "restart",
             Self::MembersReplaced(_) => "members_lost",
             Self::WindowFailed => "window_failed",
+            Self::Artefact(_) => "artefact",
+            Self::ArtefactOver => "artefact_over",
+            Self::Misfit => "model_misfit",
+            Self::FitsAgain => "model_fits",
+            Self::ParameterShift(_) => "parameter_shift",
+            Self::BeatFound => "beat_found",
+            Self::BeatMissed => "beat_missed",
+            Self::BeatUnexpected => "beat_unexpected",
         }
     }
 
@@ -141,6 +177,14 @@ impl NoticeKind {
             Self::Restart => "started anew: silence too long to bridge, or the sender's clock jumped".to_owned(),
             Self::MembersReplaced(n) => format!("{n} members lost their numbers and were replaced by others"),
             Self::WindowFailed => "no member could be solved".to_owned(),
+            Self::Artefact(artefact) => format!("set aside ({}): {}", artefact.name(), artefact.text()),
+            Self::ArtefactOver => "undisturbed again and taken back".to_owned(),
+            Self::Misfit => "the model no longer says what this sensor reads, beat after beat; bands widen".to_owned(),
+            Self::FitsAgain => "the model says again what this sensor reads".to_owned(),
+            Self::ParameterShift(_) => "a parameter has begun to move".to_owned(),
+            Self::BeatFound => "the beat was found in the pressures".to_owned(),
+            Self::BeatMissed => "no beat came when one was due; the clock waits".to_owned(),
+            Self::BeatUnexpected => "a beat came at an unexpected time; the clock was set".to_owned(),
         }
     }
 }
@@ -158,14 +202,50 @@ pub struct ChannelHealth {
     pub samples_used: u64,
     /// Root mean square of its normalised innovations, lately; NaN before any.
     pub innovation_rms: f64,
+    /// Noise that it is taken to have \[mmHg\].
+    pub noise_sd_mmhg: f64,
+    /// See [`ChannelFit::whiteness`].
+    pub whiteness: f64,
+    /// See [`ChannelFit::recurrence`].
+    pub recurrence: f64,
+    /// Why it is set aside, if it is.
+    pub artefact: Option<Artefact>,
+    /// Whether the model no longer fits it.
+    pub misfit: bool,
 }
 
-#[derive(Debug, Clone, Default)]
+/// How far a second filter is from the ensemble.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Disagreement {
+    /// Per state: difference of the means, in units of both sd together.
+    pub states: Vec<f64>,
+    /// Per estimated parameter the same.
+    pub parameters: Vec<f64>,
+}
+
+#[derive(Debug, Clone)]
 struct ChannelTally {
     samples_used: u64,
     innovation_square: Option<f64>,
+    quality: Quality,
+    /// Since when the model has not fitted, or has fitted again, other than what was said last.
+    doubted_since: Option<EventTime>,
+    misfit: bool,
     /// Last report of each cause.
     reported: BTreeMap<Refusal, ArrivalTime>,
+}
+
+impl ChannelTally {
+    fn new() -> Self {
+        Self {
+            samples_used: 0,
+            innovation_square: None,
+            quality: Quality::new(QualitySettings::default()),
+            doubted_since: None,
+            misfit: false,
+            reported: BTreeMap::new(),
+        }
+    }
 }
 
 /// The estimator of one bed.
@@ -177,6 +257,11 @@ pub struct Estimator<M> {
     estimated: Vec<usize>,
     /// None until the first window.
     ensemble: Option<Ensemble<M>>,
+    /// A filter beside it.
+    second: Option<Ensemble<M>>,
+    tracker: BeatTracker,
+    /// Beats told that lie ahead of the windows closed.
+    told: Vec<EventTime>,
     tallies: Vec<ChannelTally>,
     refused: BTreeMap<Refusal, u64>,
     restarts: u64,
@@ -203,7 +288,10 @@ impl<M: Model> Estimator<M> {
         )?;
         Ok(Self {
             cutter: WindowCutter::new(settings.window, &settings.channels),
-            tallies: vec![ChannelTally::default(); settings.channels.len()],
+            tallies: settings.channels.iter().map(|_| ChannelTally::new()).collect(),
+            tracker: tracker(&settings),
+            second: None,
+            told: Vec::new(),
             estimated: with_companions(&model, &settings.estimate),
             model,
             settings,
@@ -268,6 +356,12 @@ impl<M: Model> Estimator<M> {
                 last_sample,
                 samples_used: tally.samples_used,
                 innovation_rms: tally.innovation_square.map_or(f64::NAN, f64::sqrt),
+                noise_sd_mmhg: self.settings.channels[i].noise_sd_mmhg
+                    * self.fit(i).map_or(1.0, ChannelFit::noise_factor),
+                whiteness: self.fit(i).map_or(1.0, ChannelFit::whiteness),
+                recurrence: self.fit(i).map_or(1.0, ChannelFit::recurrence),
+                artefact: tally.quality.state(),
+                misfit: tally.misfit,
             }
         };
         self.tallies.iter().enumerate().map(health).collect()
@@ -284,7 +378,14 @@ impl<M: Model> Estimator<M> {
             Input::Tick => {}
             Input::End => self.cutter.end(),
             Input::WantMembers(want) => self.want_members = want,
+            Input::Beats(onsets) => {
+                self.told.extend(onsets);
+                self.told.sort_unstable();
+                let excess = self.told.len().saturating_sub(MAX_TOLD);
+                self.told.drain(..excess);
+            }
         }
+        let ended = self.cutter.has_ended();
         loop {
             while let Some(window) = self.cutter.next(now) {
                 self.solve(&window, parallel, out);
@@ -294,6 +395,9 @@ impl<M: Model> Estimator<M> {
             }
             self.start_anew(out);
             self.cutter.restart(now);
+        }
+        if ended {
+            self.put_out_smoothed(EventTime(i64::MAX), out);
         }
     }
 
@@ -338,6 +442,12 @@ impl<M: Model> Estimator<M> {
         }
         self.last_observation = None;
         self.beat = BeatFollower::default();
+        self.second = None;
+        self.tracker = tracker(&self.settings);
+        for tally in &mut self.tallies {
+            tally.quality = Quality::new(QualitySettings::default());
+            (tally.doubted_since, tally.misfit) = (None, false);
+        }
     }
 
     fn solve(&mut self, window: &ClosedWindow, parallel: &dyn Parallel, out: &mut Vec<Output>) {
@@ -350,27 +460,120 @@ impl<M: Model> Estimator<M> {
                 return;
             };
             self.informed = vec![window.start; ensemble.estimated().len()];
+            self.second = self.settings.live.second_opinion.and_then(|coupling| {
+                let settings = EstimatorSettings { coupling, ..self.settings.clone() };
+                Ensemble::new(self.model.clone(), settings, window.start.as_s(), parallel).ok()
+            });
             self.ensemble = Some(ensemble);
             out.push(notice(window.start, NoticeKind::Start, None));
         }
         out.extend(window.gone_silent.iter().map(|&c| notice(window.end, NoticeKind::Gap, Some(c))));
+        let observations = self.screen(window, out);
         let Some(ensemble) = &mut self.ensemble else { return };
 
-        let report = ensemble.step(&window.observations, parallel);
+        ensemble.listen(self.tracker.is_acquired());
+        let report = ensemble.step(&observations, parallel);
+        if let Some(second) = &mut self.second {
+            second.step(&observations, parallel);
+        }
         if report.solved == 0 {
             out.push(notice(window.end, NoticeKind::WindowFailed, None));
         } else if report.replaced > 0 {
             out.push(notice(window.end, NoticeKind::MembersReplaced(report.replaced), None));
         }
-        self.tally(window, &report);
-        self.publish(window, first, out);
+        let estimated = &self.estimated;
+        let shifts = report.moving.iter().map(|&k| NoticeKind::ParameterShift(estimated[k]));
+        out.extend(shifts.map(|kind| notice(window.end, kind, None)));
+        self.tally(window.end, &observations, &report, out);
+        self.keep_time(window, &observations, &report, parallel, out);
+        self.publish(window, &observations, first, out);
         self.follow_beat(window.end, out);
-        let samples = window.observations.len();
+        let samples = observations.len();
         out.push(Output::Window(WindowDone { end: window.end, closed_at: window.closed_at, samples, report }));
     }
 
-    fn tally(&mut self, window: &ClosedWindow, report: &WindowReport) {
-        for (observation, innovation) in window.observations.iter().zip(&report.innovations) {
+    /// The samples of a window without those of disturbed sensors.
+    fn screen(&mut self, window: &ClosedWindow, out: &mut Vec<Output>) -> Vec<Observation> {
+        if !self.settings.live.screen_artefacts {
+            return window.observations.clone();
+        }
+        let mut used = Vec::with_capacity(window.observations.len());
+        for observation in &window.observations {
+            let time = observed_at(window, observation);
+            let verdict = self.tallies[observation.channel].quality.take(time.as_s(), observation.value);
+            let kind = verdict.changed.map(|change| match change {
+                Change::SetAside(artefact) => NoticeKind::Artefact(artefact),
+                Change::TakenBack => NoticeKind::ArtefactOver,
+            });
+            out.extend(kind.map(|kind| notice(time, kind, Some(observation.channel))));
+            if verdict.use_sample {
+                used.push(*observation);
+            }
+        }
+        used
+    }
+
+    /// Follows the beat, and sets the clocks of the members where it went its own way.
+    fn keep_time(
+        &mut self,
+        window: &ClosedWindow,
+        observations: &[Observation],
+        report: &WindowReport,
+        parallel: &dyn Parallel,
+        out: &mut Vec<Output>,
+    ) {
+        if self.settings.live.timing == TimingSource::Clock {
+            return;
+        }
+        let Some(ensemble) = &mut self.ensemble else { return };
+        let (Some(beats), Some(rate_hz)) = (ensemble.cycles(), ensemble.rate_hz()) else { return };
+        let clock = ClockReading { time_s: window.end.as_s(), beats, rate_hz };
+        let heard = observations.iter().zip(&report.expected).map(|(o, expected)| Heard {
+            channel: o.channel,
+            time_s: observed_at(window, o).as_s(),
+            observed: o.value,
+            expected: *expected,
+        });
+        let heard: Vec<Heard> = heard.collect();
+        let found = if self.settings.live.timing == TimingSource::Told {
+            let due = self.told.partition_point(|at| *at <= window.end);
+            let onsets: Vec<f64> = self.told.drain(..due).map(EventTime::as_s).collect();
+            self.tracker.told(&onsets, clock)
+        } else {
+            let usable =
+                |i: usize| self.tallies[i].quality.state().is_none() && self.cutter.liveness(i).0 == Liveness::Live;
+            let usable: Vec<bool> = (0..self.tallies.len()).map(usable).collect();
+            self.tracker.listen(&heard, clock, &usable)
+        };
+        for (said, kind) in [
+            (found.acquired, NoticeKind::BeatFound),
+            (found.missed, NoticeKind::BeatMissed),
+            (found.surprised, NoticeKind::BeatUnexpected),
+        ] {
+            if said {
+                out.push(notice(window.end, kind, None));
+            }
+        }
+        // What a rhythm in doubt makes of the pressures says nothing about resistances.
+        ensemble.hold_parameters(self.settings.live.timing == TimingSource::Found && self.tracker.is_in_doubt());
+        if !found.edits.is_empty() {
+            ensemble.edit_clocks(&found.edits, clock.time_s, parallel);
+        }
+    }
+
+    fn tally(&mut self, end: EventTime, observations: &[Observation], report: &WindowReport, out: &mut Vec<Output>) {
+        for (channel, tally) in self.tallies.iter_mut().enumerate() {
+            let Some(fit) = self.ensemble.as_ref().map(|ensemble| ensemble.fit(channel)) else { continue };
+            let now = fit.is_misfit();
+            if now == tally.misfit {
+                tally.doubted_since = None;
+            } else if end.ns_since(*tally.doubted_since.get_or_insert(end)) >= MISFIT_NS {
+                tally.misfit = now;
+                let kind = if now { NoticeKind::Misfit } else { NoticeKind::FitsAgain };
+                out.push(notice(end, kind, Some(channel)));
+            }
+        }
+        for (observation, innovation) in observations.iter().zip(&report.innovations) {
             let tally = &mut self.tallies[observation.channel];
             tally.samples_used += 1;
             let square = innovation * innovation;
@@ -381,7 +584,7 @@ impl<M: Model> Estimator<M> {
         }
         for (at, informed) in self.informed.iter_mut().zip(&report.informed) {
             if *informed {
-                *at = window.end;
+                *at = end;
             }
         }
     }
@@ -395,24 +598,63 @@ impl<M: Model> Estimator<M> {
         }
     }
 
+    /// Puts out what lies the smoothing lag back.
+    fn put_out_smoothed(&mut self, until: EventTime, out: &mut Vec<Output>) {
+        let Some(ensemble) = &mut self.ensemble else { return };
+        while let Some((time, quantities, parameters)) = ensemble.smoothed(until) {
+            out.push(Output::Smoothed(Estimate {
+                time,
+                since_data_ns: self.last_observation.map_or(0, |last| time.ns_since(last).max(0)),
+                members: ensemble.len(),
+                quantities,
+                parameters: parameters
+                    .into_iter()
+                    .zip(&self.informed)
+                    .map(|(p, at)| (p, time.ns_since(*at).max(0)))
+                    .collect(),
+                ensemble: None,
+            }));
+        }
+    }
+
+    /// How far the second filter is from the ensemble now; None without one.
+    pub fn disagreement(&self) -> Option<Disagreement> {
+        let (first, second) = (self.ensemble.as_ref()?, self.second.as_ref()?);
+        let apart = |(a, b): (&Summary, &Summary)| (a.mean - b.mean) / a.epistemic_sd.hypot(b.epistemic_sd);
+        let states = |of: &Ensemble<M>| of.summarise_at(1.0, &mut Snapshot::default());
+        let parameters =
+            |of: &Ensemble<M>| of.summarise_parameters().into_iter().map(|p| p.summary).collect::<Vec<_>>();
+        Some(Disagreement {
+            states: states(first).iter().zip(&states(second)).take(self.model.n_states()).map(apart).collect(),
+            parameters: parameters(first).iter().zip(&parameters(second)).map(apart).collect(),
+        })
+    }
+
     /// Puts out an estimate for every published time in the window.
-    fn publish(&mut self, window: &ClosedWindow, first: bool, out: &mut Vec<Output>) {
+    fn publish(&mut self, window: &ClosedWindow, observations: &[Observation], first: bool, out: &mut Vec<Output>) {
         let period = self.settings.publish_period_ns;
         let before = if first { window.start.0 - 1 } else { window.start.0 };
         let mut time = EventTime((before.div_euclid(period) + 1) * period);
         while time <= window.end {
-            out.push(Output::Estimate(self.estimate(window, time)));
+            out.push(Output::Estimate(self.estimate(window, observations, time)));
+            if self.settings.live.smoothing_lag_ns > 0
+                && let Some(ensemble) = &mut self.ensemble
+            {
+                ensemble.remember(time, position(window, time));
+            }
             time = time.plus_ns(period);
         }
-        if let Some(last) = window.observations.last() {
+        if let Some(last) = observations.last() {
             self.last_observation = Some(observed_at(window, last));
+        }
+        if self.settings.live.smoothing_lag_ns > 0 {
+            self.put_out_smoothed(window.end.plus_ns(-self.settings.live.smoothing_lag_ns), out);
         }
     }
 
-    #[allow(clippy::cast_precision_loss)]
-    fn estimate(&mut self, window: &ClosedWindow, time: EventTime) -> Estimate {
-        let s = time.ns_since(window.start) as f64 / self.settings.window.length_ns as f64;
-        let within = window.observations.iter().map(|o| observed_at(window, o)).filter(|t| *t <= time).max();
+    fn estimate(&mut self, window: &ClosedWindow, observations: &[Observation], time: EventTime) -> Estimate {
+        let s = position(window, time);
+        let within = observations.iter().map(|o| observed_at(window, o)).filter(|t| *t <= time).max();
         let last_data = within.or(self.last_observation);
         let Some(ensemble) = &self.ensemble else {
             return Estimate {
@@ -434,6 +676,16 @@ impl<M: Model> Estimator<M> {
             ensemble: self.want_members.then(|| ensemble.members_at_end()),
         }
     }
+}
+
+fn tracker(settings: &EstimatorSettings) -> BeatTracker {
+    BeatTracker::new(settings.live.timing, settings.channels.len(), settings.live.timing_channels.clone())
+}
+
+/// Where in a window a time lies, in `[0, 1]`.
+#[allow(clippy::cast_precision_loss)]
+fn position(window: &ClosedWindow, time: EventTime) -> f64 {
+    time.ns_since(window.start) as f64 / window.end.ns_since(window.start) as f64
 }
 
 fn notice(time: EventTime, kind: NoticeKind, channel: Option<usize>) -> Output {

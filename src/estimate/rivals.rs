@@ -48,7 +48,7 @@ fn covariance(a: &[f64], b: &[f64], members: usize) -> Vec<f64> {
 fn gain(cross: &[f64], innovation: &[f64], m: usize) -> Option<Vec<f64>> {
     let mut factor = innovation.to_vec();
     semidefinite_cholesky(&mut factor, m);
-    if (0..m).any(|i| !(factor[i * m + i] > 0.0)) {
+    if (0..m).any(|i| factor[i * m + i] <= 0.0) {
         return None;
     }
     let mut gain = cross.to_vec();

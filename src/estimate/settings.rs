@@ -2,6 +2,7 @@
 //! (files, environment, command line) and whether they make sense together is the business of the edge.
 
 use super::time::s_from_ns;
+use super::timing::TimingSource;
 use crate::model::{Model, ParameterInfo, Transform};
 use crate::xtfc::features::FeatureSpec;
 use crate::xtfc::problem::Stopping;
@@ -139,6 +140,21 @@ impl Adaptation {
     pub const ON: Self = Self { pace: true, noise: (0.4, 3.0), excess: 1e4, outlier_sd: 4.0 };
 }
 
+/// What an estimator does beside its windows.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct LiveSettings {
+    /// Where the beat comes from.
+    pub timing: TimingSource,
+    /// Channels in which beats are looked for, the most trusted first.
+    pub timing_channels: Vec<usize>,
+    /// Whether channels are set aside while their sensor is disturbed.
+    pub screen_artefacts: bool,
+    /// How long estimates are corrected before they are put out a second time \[ns\]; 0 is never.
+    pub smoothing_lag_ns: i64,
+    /// A filter that runs beside, to compare with.
+    pub second_opinion: Option<CouplingKind>,
+}
+
 /// Everything else.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EstimatorSettings {
@@ -174,6 +190,8 @@ pub struct EstimatorSettings {
     pub channels: Vec<ChannelSettings>,
     /// Sensor noise by state \[mmHg\], whether listened to or not; 0 where unknown. `[n_states]`.
     pub aleatoric_sd_mmhg: Vec<f64>,
+    /// What it does beside its windows.
+    pub live: LiveSettings,
     /// Spacing of the published estimates \[ns\].
     pub publish_period_ns: i64,
 }

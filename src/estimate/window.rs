@@ -283,6 +283,12 @@ impl WindowCutter {
         self.ended = true;
     }
 
+    /// Whether everything delivered may be closed.
+    #[must_use]
+    pub fn has_ended(&self) -> bool {
+        self.ended
+    }
+
     /// The next window that is final at `now`, if any; call until there is none.
     pub fn next(&mut self, now: ArrivalTime) -> Option<ClosedWindow> {
         let (start, first) = match self.closed_to {

@@ -649,6 +649,22 @@ impl Model for Cvsim6 {
         theta[Parameter::BeatPhase as usize] += dt_s * rate;
     }
 
+    fn set_clock(&self, phase: f64, x: &mut [f64], theta: &mut [f64]) {
+        let capacitances = |theta: &[f64]| {
+            let moment = self.moment(0.0, &[0.0; Pressures::LEN], theta);
+            (moment.c_l.value_and_rate().value, moment.c_r.value_and_rate().value)
+        };
+        let before = capacitances(theta);
+        theta[Parameter::BeatPhase as usize] = phase;
+        let after = capacitances(theta);
+        let p_th = theta[Parameter::PTh as usize];
+        // The blood in the ventricles stays where it is.
+        for (state, before, after) in [(State::L, before.0, after.0), (State::R, before.1, after.1)] {
+            let pressure = &mut x[state as usize];
+            *pressure = p_th + (*pressure - p_th) * before / after;
+        }
+    }
+
     fn cycle(&self) -> Option<Cycle> {
         Some(Cycle { rate: Parameter::HeartRate as usize, phase: Parameter::BeatPhase as usize })
     }

@@ -236,6 +236,10 @@ impl<M: Model> Model for Discrepant<M> {
         self.base.advance(dt_s, theta);
     }
 
+    fn set_clock(&self, phase: f64, x: &mut [f64], theta: &mut [f64]) {
+        self.base.set_clock(phase, &mut x[..self.base.n_states()], theta);
+    }
+
     fn cycle(&self) -> Option<Cycle> {
         self.base.cycle()
     }

@@ -228,6 +228,14 @@ pub trait Model: Clone + Send + Sync + 'static {
         let _ = (dt_s, theta);
     }
 
+    /// Sets the clock parameter to `phase` and keeps what does not jump with it (volumes, where states are pressures).
+    fn set_clock(&self, phase: f64, x: &mut [f64], theta: &mut [f64]) {
+        let _ = x;
+        if let Some(cycle) = self.cycle() {
+            theta[cycle.phase] = phase;
+        }
+    }
+
     /// What makes it periodic, if anything does.
     fn cycle(&self) -> Option<Cycle> {
         None

@@ -9,7 +9,8 @@ use super::plot::{Chart, Colour, Figure};
 use super::report::{Report, Table, mean, plus_minus, rms, short};
 use super::{Context, StudyError, timed};
 use crate::estimate::settings::{
-    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
+    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, LiveSettings, RowWeights,
+    WindowSettings,
 };
 use crate::estimate::statistics::{Summary, mean_and_sd};
 use crate::estimate::time::ns_from_s;
@@ -117,6 +118,7 @@ impl Setup {
             },
             drift: Drift { states: with(0.0, 0.0), inflation: 1.0 },
             adaptation: Adaptation::OFF,
+            live: LiveSettings::default(),
             stopping: Stopping { max_iterations: 50, tolerance_mmhg: 1e-6 },
             channels: vec![ChannelSettings {
                 state: 0,

@@ -9,7 +9,8 @@ use super::plot::{Chart, Colour, Figure};
 use super::report::{Report, Table, mean, rms, short};
 use super::{Context, StudyError};
 use crate::estimate::settings::{
-    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
+    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, LiveSettings, RowWeights,
+    WindowSettings,
 };
 use crate::estimate::time::{NS_PER_S, ns_from_s};
 use crate::model::Model;
@@ -242,6 +243,7 @@ impl<M: Model> Task<'_, M> {
             weights: RowWeights { physics: padded(vec![1.0; n], UNKNOWN_WEIGHT), data: DATA_WEIGHT, parameter: 1.0 },
             drift: Drift { states: padded(vec![0.0; n], 0.0), inflation: 1.0 },
             adaptation: Adaptation::OFF,
+            live: LiveSettings::default(),
             stopping: Stopping { max_iterations: 50, tolerance_mmhg: 1e-8 },
             channels: (0..n).map(channel).collect(),
             aleatoric_sd_mmhg: padded(vec![self.noise_sd; n], 0.0),

@@ -2,7 +2,8 @@
 
 use hemostream::estimate::ensemble::{Ensemble, Observation, Serial};
 use hemostream::estimate::settings::{
-    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
+    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, LiveSettings, RowWeights,
+    WindowSettings,
 };
 use hemostream::model::{Model, ParameterInfo, Quantity, Transform};
 use hemostream::xtfc::features::FeatureSpec;
@@ -81,6 +82,7 @@ fn settings(members: usize) -> EstimatorSettings {
         weights: RowWeights { physics: vec![1e4; 2], data: 1.0, parameter: 10.0 },
         drift: Drift { states: vec![DRIFT_X; 2], inflation: 1.0 },
         adaptation: Adaptation::OFF,
+        live: LiveSettings::default(),
         stopping: Stopping::default(),
         channels: vec![ChannelSettings { state: 0, noise_sd_mmhg: NOISE, plausible_mmhg: (-1e3, 1e3) }],
         aleatoric_sd_mmhg: vec![NOISE, 0.0],

@@ -3,7 +3,8 @@
 use hemostream::estimate::ensemble::Serial;
 use hemostream::estimate::estimator::{Estimate, Estimator, Input, Output};
 use hemostream::estimate::settings::{
-    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, RowWeights, WindowSettings,
+    Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, LiveSettings, RowWeights,
+    WindowSettings,
 };
 use hemostream::estimate::time::{ArrivalTime, EventTime, ns_from_s};
 use hemostream::estimate::window::RawSample;
@@ -47,6 +48,7 @@ pub fn settings(coupling: CouplingKind, observed: &[State], estimate: &[Paramete
         weights: RowWeights { physics: vec![1.0; 6], data: 1.0, parameter: 10.0 },
         drift: Drift { states: vec![0.01; 6], inflation: 1.0 },
         adaptation: Adaptation::OFF,
+        live: LiveSettings::default(),
         stopping: Stopping::default(),
         channels: observed.iter().map(channel).collect(),
         aleatoric_sd_mmhg: NOISE.to_vec(),

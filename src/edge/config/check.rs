@@ -11,7 +11,8 @@ use super::keys::{self, KeyPath};
 use super::layers::Stack;
 use super::patient::{InitialSd, Patient, ScriptEntry};
 use super::schema::{
-    Config, DiscrepancyForm, Distribution, EstimatorSettings, PriorSettings, PublishSettings, WindowSettings,
+    Config, Coupling, DiscrepancyForm, Distribution, EstimatorSettings, PriorSettings, PublishSettings, Timing,
+    WindowSettings,
 };
 use crate::model::cvsim6::{Cvsim6, PARAMETERS, Pressures};
 use crate::model::{Model, ParameterInfo};
@@ -243,6 +244,25 @@ impl Checker {
         self.number("estimator.noise_range.1", high, &(1.0..=1000.0), "");
         self.number("estimator.outlier_sd", estimator.outlier_sd, &(1.0..=1e9), "");
         self.number("estimator.smoothing_lag_s", estimator.smoothing_lag_s, &(0.0..=60.0), " s");
+        let estimates_rate = estimator.estimate.iter().any(|name| name == "heart_rate");
+        match estimator.timing {
+            Timing::Tracked if !estimates_rate => {
+                let message = "found \"tracked\", expected \"heart_rate\" in `estimator.estimate` with it";
+                self.refuse_against("estimator.timing", "estimator.estimate", message.to_owned());
+            }
+            Timing::Beats if estimates_rate => {
+                let message =
+                    "found \"beats\", which tell the heart rate, expected no \"heart_rate\" in `estimator.estimate`";
+                self.refuse_against("estimator.timing", "estimator.estimate", message.to_owned());
+            }
+            _ => {}
+        }
+        let coupled = estimator.coupling == Coupling::Coupled;
+        if !coupled && (estimator.timing != Timing::Config || estimator.smoothing_lag_s > 0.0) {
+            let message =
+                "found another one, expected \"coupled\" where beats are followed or estimates looked back at";
+            self.refuse("estimator.coupling", message);
+        }
         self.whole("estimator.max_iterations", estimator.max_iterations, 1..=100);
         let fraction = (Bound::Excluded(0.0), Bound::Excluded(1.0));
         self.number("estimator.tolerance", estimator.tolerance, &fraction, "");

@@ -31,7 +31,8 @@ pub use keys::known_keys;
 pub use patient::{InitialSd, Patient, PulmonaryLaw, ScriptEntry, Systole};
 pub use schema::{
     Activation, ChannelSettings, Config, Coupling, DiscrepancyForm, DiscrepancySettings, Distribution,
-    EstimatorSettings, Nodes, PerState, PublishSettings, ServiceSettings, WindowSettings, ZenohMode, ZenohSettings,
+    EstimatorSettings, Nodes, PerState, PriorSettings, PublishSettings, SecondOpinion, ServiceSettings, Timing,
+    WindowSettings, ZenohMode, ZenohSettings,
 };
 
 impl Config {

@@ -107,6 +107,11 @@ pub struct EstimatorSettings {
     pub timing: Timing,
     /// How far estimates are looked back at \[s\]; 0 is not.
     pub smoothing_lag_s: f64,
+    /// Whether disturbed sensors are set aside.
+    pub screen_artefacts: bool,
+    /// A filter that runs beside the ensemble.
+    #[serde(deserialize_with = "by_name")]
+    pub second_opinion: SecondOpinion,
     /// Gauss-Newton iterations of one window.
     pub max_iterations: usize,
     /// Error of the pressures left by the linearisation at which iterations stop \[mmHg\].
@@ -145,6 +150,19 @@ pub enum Timing {
     Beats,
     /// Onsets found in the pressures, then heart rate and phase as parameters.
     Tracked,
+}
+
+/// A filter beside the ensemble, whose distance from it is published.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SecondOpinion {
+    /// None.
+    #[default]
+    None,
+    /// Unscented Kalman filter.
+    Ukf,
+    /// Ensemble Kalman filter.
+    Enkf,
 }
 
 /// How data enter the solve.
@@ -388,6 +406,8 @@ impl Default for EstimatorSettings {
             outlier_sd: 4.0,
             timing: Timing::Config,
             smoothing_lag_s: 0.0,
+            screen_artefacts: true,
+            second_opinion: SecondOpinion::None,
             max_iterations: 20,
             tolerance: 1e-9,
         }

@@ -42,6 +42,10 @@ const KEPT_PER_BEAT: f64 = 0.95;
 /// Mean square of the phases above which what comes back is hardly an accident (3 % of the channels that fit).
 const SYSTEMATIC: f64 = 1.7;
 
+/// Beyond these the model does not fit.
+const MISFIT_RECURRENCE: f64 = 3.5;
+const MISFIT_EXCESS: f64 = 300.0;
+
 /// Innovations of one phase of the beat.
 #[derive(Debug, Clone, Copy, Default)]
 struct Phase {
@@ -126,6 +130,12 @@ impl ChannelFit {
         let square = |phase: &Phase| phase.sum * phase.sum / phase.square_weight;
         let known: Vec<f64> = self.phases.iter().filter(|phase| phase.square_weight > 0.0).map(square).collect();
         if known.len() < PHASES / 2 { 1.0 } else { known.iter().sum::<f64>() / known.len() as f64 }
+    }
+
+    /// Whether the model does not fit: what it misses comes back with every beat, or is only covered by extra noise.
+    #[must_use]
+    pub fn is_misfit(&self) -> bool {
+        self.recurrence() > MISFIT_RECURRENCE || self.log_excess > MISFIT_EXCESS.ln()
     }
 
     /// Standard deviation of what the model misses in every beat, as far as it stands out of the noise \[mmHg\].
