@@ -1,11 +1,11 @@
 //! From outputs to topics: encoding, sequence numbers, last values for late joiners.
 //!
-//! Workers encode and hand over to one publishing thread through a bounded queue; estimates that do not fit are
-//! dropped and counted, events wait. JSON twins are made only while somebody subscribes to them.
+//! Workers encode and hand over to one publishing thread through a bounded queue. Estimates that do not fit are dropped
+//! and counted; events have room of their own behind them, so that a subscriber that hangs costs estimates first. JSON twins are made only while somebody subscribes to them.
 
 use std::collections::HashMap;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, TrySendError, sync_channel};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use serde::Serialize;
@@ -25,8 +25,9 @@ use crate::model::discrepancy::Circulation;
 use crate::runtime::bed::{Bed, Health};
 use crate::runtime::service::Sink;
 
-/// Messages that may wait for the publishing thread.
+/// Messages that may wait for the publishing thread, and how many more if they are events.
 const QUEUE: usize = 4096;
+const EVENTS: usize = 1024;
 
 /// Keys whose last value is kept.
 const MAX_LAST_VALUES: usize = 65_536;
@@ -42,6 +43,7 @@ pub struct Outlet {
     json: bool,
     model: Circulation,
     queue: Option<SyncSender<(Message, Delivery)>>,
+    waiting: Arc<AtomicUsize>,
     dropped: AtomicU64,
     last: LastStore,
     sequences: Mutex<HashMap<String, u64>>,
@@ -60,11 +62,12 @@ impl Outlet {
         // Keys of this service only; the pattern must not answer for the pressures.
         let pattern = format!("{}/**", config.publish.prefix);
         let answers = bus.offer_last_values(&pattern, Arc::new(move |asked| answer(&offered, asked)))?;
-        let (queue, waiting) = sync_channel(QUEUE);
-        let publisher = Arc::clone(&bus);
+        let (queue, messages) = sync_channel(QUEUE + EVENTS);
+        let waiting = Arc::<AtomicUsize>::default();
+        let (publisher, left) = (Arc::clone(&bus), Arc::clone(&waiting));
         let thread = std::thread::Builder::new()
             .name("publish".to_owned())
-            .spawn(move || publish_all(publisher.as_ref(), &waiting))
+            .spawn(move || publish_all(publisher.as_ref(), &messages, &left))
             .map_err(|e| BusError::Transport(e.to_string()))?;
         Ok(Self {
             bus,
@@ -74,6 +77,7 @@ impl Outlet {
             json: config.publish.json,
             model: config.circulation().map_err(|e| BusError::Transport(e.to_string()))?,
             queue: Some(queue),
+            waiting,
             dropped: AtomicU64::new(0),
             last,
             sequences: Mutex::default(),
@@ -121,16 +125,10 @@ impl Outlet {
 
     fn queue(&self, message: Message, delivery: Delivery) {
         let Some(queue) = &self.queue else { return };
-        let lost = match delivery {
-            Delivery::Events => queue.send((message, delivery)).is_err(),
-            Delivery::Samples | Delivery::Estimates => {
-                matches!(
-                    queue.try_send((message, delivery)),
-                    Err(TrySendError::Full(_) | TrySendError::Disconnected(_))
-                )
-            }
-        };
-        if lost {
+        let has_room = delivery == Delivery::Events || self.waiting.load(Ordering::Relaxed) < QUEUE;
+        self.waiting.fetch_add(1, Ordering::Relaxed);
+        if !has_room || queue.try_send((message, delivery)).is_err() {
+            self.waiting.fetch_sub(1, Ordering::Relaxed);
             self.dropped.fetch_add(1, Ordering::Relaxed);
         }
     }
@@ -220,9 +218,10 @@ impl Drop for Outlet {
     }
 }
 
-fn publish_all(bus: &dyn Bus, waiting: &Receiver<(Message, Delivery)>) {
+fn publish_all(bus: &dyn Bus, messages: &Receiver<(Message, Delivery)>, waiting: &AtomicUsize) {
     let mut failures = 0_u64;
-    for (message, delivery) in waiting {
+    for (message, delivery) in messages {
+        waiting.fetch_sub(1, Ordering::Relaxed);
         if let Err(error) = bus.publish(message, delivery) {
             failures += 1;
             if failures.is_power_of_two() {

@@ -23,6 +23,9 @@ pub const REPORT_EVERY_NS: i64 = 10 * NS_PER_S;
 /// How long a model must not fit, or fit again, before it is said \[ns\].
 const MISFIT_NS: i64 = 2 * NS_PER_S;
 
+/// Time without a shift after which a parameter is said to have begun to move \[ns\].
+const CALM_NS: i64 = 5 * NS_PER_S;
+
 /// Beats told ahead of the windows that are kept.
 const MAX_TOLD: usize = 1024;
 
@@ -268,6 +271,8 @@ pub struct Estimator<M> {
     last_observation: Option<EventTime>,
     /// End of the last window that said something about each estimated parameter.
     informed: Vec<EventTime>,
+    /// When each estimated parameter last began to move, or the start.
+    calm_since: Vec<EventTime>,
     want_members: bool,
     beat: BeatFollower,
     scratch: Snapshot,
@@ -300,6 +305,7 @@ impl<M: Model> Estimator<M> {
             restarts: 0,
             last_observation: None,
             informed: Vec::new(),
+            calm_since: Vec::new(),
             want_members: false,
             beat: BeatFollower::default(),
             scratch: Snapshot::default(),
@@ -460,6 +466,7 @@ impl<M: Model> Estimator<M> {
                 return;
             };
             self.informed = vec![window.start; ensemble.estimated().len()];
+            self.calm_since.clone_from(&self.informed);
             self.second = self.settings.live.second_opinion.and_then(|coupling| {
                 let settings = EstimatorSettings { coupling, ..self.settings.clone() };
                 Ensemble::new(self.model.clone(), settings, window.start.as_s(), parallel).ok()
@@ -481,9 +488,13 @@ impl<M: Model> Estimator<M> {
         } else if report.replaced > 0 {
             out.push(notice(window.end, NoticeKind::MembersReplaced(report.replaced), None));
         }
-        let estimated = &self.estimated;
-        let shifts = report.moving.iter().map(|&k| NoticeKind::ParameterShift(estimated[k]));
-        out.extend(shifts.map(|kind| notice(window.end, kind, None)));
+        for &k in &report.moving {
+            // What is still being found out has not begun to move; and once said is enough.
+            if window.end.ns_since(self.calm_since[k]) >= CALM_NS {
+                out.push(notice(window.end, NoticeKind::ParameterShift(self.estimated[k]), None));
+            }
+            self.calm_since[k] = window.end;
+        }
         self.tally(window.end, &observations, &report, out);
         self.keep_time(window, &observations, &report, parallel, out);
         self.publish(window, &observations, first, out);
