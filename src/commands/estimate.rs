@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use hemostream::edge::config::Config;
-use hemostream::edge::files::csv::{RecordReader, TableWriter, estimate_header, estimate_row};
+use hemostream::edge::files::csv::{TableWriter, beat_header, beat_row, estimate_header, estimate_row};
+use hemostream::edge::files::record::Record;
+use hemostream::edge::outlet::notice_text;
 use hemostream::estimate::estimator::{Estimator, Input, Output};
 use hemostream::estimate::time::ArrivalTime;
 use hemostream::estimate::window::RawSample;
@@ -21,14 +23,20 @@ use super::{ConfigArgs, Failure, failed, progress_bar, say};
 #[derive(Args)]
 #[command(after_help = "Example:  hemostream estimate observed.csv --config config/paper.toml --output out.csv")]
 pub(crate) struct Estimate {
-    /// Record (CSV): `time_s` and any of the six pressures, by name or monitor label
-    #[arg(value_name = "INPUT")]
-    input: PathBuf,
+    /// Record: CSV with `time_s` and any of the six pressures, by name or monitor label, or the header of a WFDB record
+    #[arg(value_name = "INPUT", required_unless_present = "record", conflicts_with = "record")]
+    input: Option<PathBuf>,
+    /// The same by name
+    #[arg(long, value_name = "PATH")]
+    record: Option<PathBuf>,
     #[command(flatten)]
     config: ConfigArgs,
     /// Where to write the estimates (CSV)
     #[arg(long, value_name = "FILE")]
     output: PathBuf,
+    /// Where to write what is read off each heart beat (CSV): stroke volume, cardiac output, resistances, pressures
+    #[arg(long, value_name = "FILE")]
+    beats: Option<PathBuf>,
     /// Worker threads, over the configuration; 0 is one per core
     #[arg(long)]
     threads: Option<usize>,
@@ -44,15 +52,20 @@ impl Estimate {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
         let known = |e: &str| e.eq_ignore_ascii_case("csv");
-        if !self.output.extension().and_then(|e| e.to_str()).is_some_and(known) {
-            let message = format!("{}: found another ending, expected .csv", self.output.display());
-            return Err(Failure::Input(message));
+        for output in [Some(&self.output), self.beats.as_ref()].into_iter().flatten() {
+            if !output.extension().and_then(|e| e.to_str()).is_some_and(known) {
+                let message = format!("{}: found another ending, expected .csv", output.display());
+                return Err(Failure::Input(message));
+            }
         }
+        let Some(input) = self.record.as_ref().or(self.input.as_ref()) else {
+            return Err(Failure::Input("found no record, expected INPUT or --record".to_owned()));
+        };
         let workers = Workers::start(self.threads.unwrap_or(config.service.workers)).map_err(failed)?;
         // Read it to the end once: a bad cell is reported before anything is computed or written.
-        let seconds = check_record(&self.input, &config)?;
-        let reader = RecordReader::open(&self.input, &config)?;
-        let mut run = Run::new(&config, &self.output, &reader, seconds)?;
+        let seconds = check_record(input, &config)?;
+        let reader = Record::open(input, &config)?;
+        let mut run = Run::new(&config, &self.output, self.beats.as_deref(), &reader, seconds)?;
         run.record(reader, &workers)?;
         run.finish(&workers)
     }
@@ -60,7 +73,7 @@ impl Estimate {
 
 /// Reads the whole record; returns its length \[s\].
 fn check_record(path: &Path, config: &Config) -> Result<f64, Failure> {
-    let mut reader = RecordReader::open(path, config)?;
+    let mut reader = Record::open(path, config)?;
     let (mut first, mut last) = (None, None);
     while let Some(row) = reader.next_row()? {
         first.get_or_insert(row.time);
@@ -75,6 +88,9 @@ struct Run {
     /// Channel of each column, where it is listened to.
     channels: Vec<Option<usize>>,
     table: TableWriter,
+    beats: Option<TableWriter>,
+    /// Whether the table holds what is known after the smoothing lag.
+    smoothed: bool,
     outputs: Vec<Output>,
     progress: ProgressBar,
     clock: Clock,
@@ -87,7 +103,13 @@ struct Run {
 }
 
 impl Run {
-    fn new(config: &Config, output: &Path, reader: &RecordReader, seconds: f64) -> Result<Self, Failure> {
+    fn new(
+        config: &Config,
+        output: &Path,
+        beats: Option<&Path>,
+        reader: &Record,
+        seconds: f64,
+    ) -> Result<Self, Failure> {
         let model = config.circulation()?;
         let estimator = Estimator::new(model.clone(), config.estimator_settings()?).map_err(failed)?;
         let channel = |state: &usize| estimator.settings().channels.iter().position(|c| c.state == *state);
@@ -102,6 +124,8 @@ impl Run {
         let progress = progress_bar(whole(seconds), "{bar:40} {pos}/{len} s  {eta} left");
         Ok(Self {
             table: TableWriter::create(output, &estimate_header(&model, estimator.estimated()))?,
+            beats: beats.map(|path| TableWriter::create(path, &beat_header(&model))).transpose()?,
+            smoothed: config.estimator.smoothing_lag_s > 0.0,
             estimator,
             channels,
             outputs: Vec::new(),
@@ -117,7 +141,7 @@ impl Run {
     }
 
     /// A file has no arrivals: every sample arrives when it was taken.
-    fn record(&mut self, mut reader: RecordReader, workers: &Workers) -> Result<(), Failure> {
+    fn record(&mut self, mut reader: Record, workers: &Workers) -> Result<(), Failure> {
         let mut start = None;
         while let Some(row) = reader.next_row()? {
             self.last = ArrivalTime(row.time.0);
@@ -141,8 +165,14 @@ impl Run {
         self.estimator.handle(input, self.last, workers, &mut self.outputs);
         for output in self.outputs.drain(..) {
             match output {
-                Output::Estimate(estimate) => self.table.row(&estimate_row(&estimate))?,
-                Output::Beat(_) | Output::Smoothed(_) => {}
+                Output::Estimate(estimate) if !self.smoothed => self.table.row(&estimate_row(&estimate))?,
+                Output::Smoothed(estimate) => self.table.row(&estimate_row(&estimate))?,
+                Output::Beat(beat) => {
+                    if let Some(table) = &mut self.beats {
+                        table.row(&beat_row(&beat))?;
+                    }
+                }
+                Output::Estimate(_) => {}
                 Output::Window(window) => {
                     self.windows += 1;
                     self.iterations += window.report.iterations as u64;
@@ -157,7 +187,7 @@ impl Run {
                         channel = name,
                         "{}: {}",
                         notice.kind.name(),
-                        notice.kind.text()
+                        notice_text(model, notice.kind)
                     );
                 }
             }
@@ -170,6 +200,9 @@ impl Run {
         self.drive(Input::End, workers)?;
         self.progress.finish_and_clear();
         self.table.finish()?;
+        if let Some(beats) = self.beats {
+            beats.finish()?;
+        }
         let wall = hemostream::estimate::time::s_from_ns(self.clock.now().0);
         let member_windows = self.windows as f64 * self.estimator.settings().members as f64;
         say(format!(

@@ -17,6 +17,7 @@ use clap::{Args, Parser, Subcommand};
 use hemostream::edge::bus::BusError;
 use hemostream::edge::config::{Config, ConfigError, Origins};
 use hemostream::edge::files::csv::CsvError;
+use hemostream::edge::files::record::RecordError;
 use hemostream::edge::replay::ReplayError;
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -77,6 +78,12 @@ impl From<ConfigError> for Failure {
 
 impl From<CsvError> for Failure {
     fn from(error: CsvError) -> Self {
+        Self::Input(error.to_string())
+    }
+}
+
+impl From<RecordError> for Failure {
+    fn from(error: RecordError) -> Self {
         Self::Input(error.to_string())
     }
 }

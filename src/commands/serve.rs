@@ -27,7 +27,7 @@ pub(crate) struct Serve {
 pub(crate) struct Running {
     inlet: Inlet,
     task: tokio::task::JoinHandle<()>,
-    _listening: hemostream::edge::bus::Subscription,
+    _listening: Vec<hemostream::edge::bus::Subscription>,
 }
 
 impl Running {

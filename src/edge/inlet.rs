@@ -3,9 +3,9 @@
 
 use std::sync::Arc;
 
-use super::bus::{Bus, BusError, Message, Subscription};
-use super::config::Config;
-use super::wire::{FLAG_LAST_BLOCK, PressureBlock, WireError, decode};
+use super::bus::{Bus, BusError, Handler, Message, Subscription};
+use super::config::{Config, Timing};
+use super::wire::{Beats, FLAG_LAST_BLOCK, PressureBlock, WireError, decode};
 use crate::estimate::time::EventTime;
 use crate::estimate::window::RawSample;
 use crate::model::Model;
@@ -22,6 +22,8 @@ struct Decoder {
     labels: Vec<(String, usize)>,
     /// Labels of states that are known but not listened to.
     ignored: Vec<String>,
+    /// Whether beats are told.
+    told: bool,
 }
 
 impl Decoder {
@@ -39,12 +41,17 @@ impl Decoder {
                 None => ignored.push(label),
             }
         }
-        Self { prefix: config.publish.prefix.clone(), labels, ignored }
+        let told = config.estimator.timing == Timing::Beats;
+        Self { prefix: config.publish.prefix.clone(), labels, ignored, told }
     }
 
     /// The bed and what to do; None for what is not meant for this service.
     fn event(&self, message: &Message) -> Option<Event> {
         let rest = message.key.strip_prefix(&self.prefix)?.strip_prefix('/')?;
+        if let Some(bed) = rest.strip_suffix("/beat") {
+            let task = if self.told { beats(message).unwrap_or_else(Task::Refused) } else { return None };
+            return Some(Event::Task { bed: bed.to_owned(), task });
+        }
         let (bed, channel) = rest.split_once("/pressure/")?;
         if self.ignored.iter().any(|label| label == channel) {
             return None;
@@ -57,12 +64,24 @@ impl Decoder {
     }
 }
 
-fn task(message: &Message, channel: usize) -> Result<Task, &'static str> {
-    let block: PressureBlock = decode(&message.payload, message.encoding).map_err(|error| match error {
+fn refusal(error: &WireError) -> &'static str {
+    match error {
         WireError::TooLong(_) => "oversized",
         WireError::Malformed(_) => "malformed",
         WireError::Schema(_) => "wrong_schema",
-    })?;
+    }
+}
+
+fn beats(message: &Message) -> Result<Task, &'static str> {
+    let beats: Beats = decode(&message.payload, message.encoding).map_err(|error| refusal(&error))?;
+    if beats.onsets_ns.len() > MAX_BLOCK_SAMPLES {
+        return Err("oversized");
+    }
+    Ok(Task::Beats(beats.onsets_ns.into_iter().map(EventTime).collect()))
+}
+
+fn task(message: &Message, channel: usize) -> Result<Task, &'static str> {
+    let block: PressureBlock = decode(&message.payload, message.encoding).map_err(|error| refusal(&error))?;
     if block.values.len() > MAX_BLOCK_SAMPLES {
         return Err("oversized");
     }
@@ -94,19 +113,21 @@ fn samples(block: &PressureBlock) -> Option<Vec<RawSample>> {
     block.values.iter().enumerate().map(sample).collect()
 }
 
-/// Listens to the pressures of all beds.
+/// Listens to the pressures of all beds, and to their beats where these are told.
 ///
 /// # Errors
 /// When the bus does not take the subscription.
-pub fn listen(bus: &dyn Bus, config: &Config, inlet: Inlet) -> Result<Subscription, BusError> {
+pub fn listen(bus: &dyn Bus, config: &Config, inlet: Inlet) -> Result<Vec<Subscription>, BusError> {
     let decoder = Decoder::new(config);
-    let pattern = format!("{}/*/pressure/*", config.publish.prefix);
-    bus.subscribe(
-        &pattern,
-        Arc::new(move |message| {
-            if let Some(event) = decoder.event(&message) {
-                inlet.offer(event);
-            }
-        }),
-    )
+    let prefix = &config.publish.prefix;
+    let mut patterns = vec![format!("{prefix}/*/pressure/*")];
+    if decoder.told {
+        patterns.push(format!("{prefix}/*/beat"));
+    }
+    let take: Handler = Arc::new(move |message| {
+        if let Some(event) = decoder.event(&message) {
+            inlet.offer(event);
+        }
+    });
+    patterns.iter().map(|pattern| bus.subscribe(pattern, Arc::clone(&take))).collect()
 }

@@ -14,9 +14,11 @@ use serde::de::DeserializeOwned;
 use super::bus::{self, Bus, BusError, Delivery, Encoding, Message, Subscription};
 use super::config::Config;
 use super::wire::{
-    self, ChannelStatus, Event, Header, Members, ParameterEstimate, SCHEMA, StateEstimate, Status, ToJson,
+    self, BeatEstimate, ChannelStatus, Event, Header, Members, ParameterEstimate, SCHEMA, StateEstimate, Status, ToJson,
 };
-use crate::estimate::estimator::{Estimate, Notice, Output};
+use crate::estimate::beat;
+use crate::estimate::estimator::{Estimate, Notice, NoticeKind, Output};
+use crate::estimate::signal::quality::Artefact;
 use crate::estimate::statistics::Summary;
 use crate::estimate::time::{EventTime, s_from_ns};
 use crate::estimate::window::Liveness;
@@ -151,9 +153,33 @@ impl Outlet {
         }
     }
 
+    fn smoothed(&self, bed: &Bed, estimate: &Estimate) {
+        let key = self.key(&bed.name, "estimate/smoothed");
+        let header = self.header(&key, estimate.time);
+        let mut message = state_message(header, &self.model, estimate);
+        for (p, _) in &estimate.parameters {
+            message.names.push(self.model.parameters()[p.parameter].name.to_owned());
+            message.values.extend(state_statistics(&p.summary));
+        }
+        self.send(key, &message, Delivery::Estimates);
+    }
+
+    fn beat(&self, bed: &Bed, beat: &beat::BeatEstimate) {
+        let key = self.key(&bed.name, "estimate/beat");
+        let message = BeatEstimate {
+            header: self.header(&key, beat.start),
+            members: count(bed.estimator().settings().members),
+            end_ns: beat.end.0,
+            names: self.model.clinical().iter().map(|q| q.name.to_owned()).collect(),
+            units: self.model.clinical().iter().map(|q| q.unit.to_owned()).collect(),
+            values: beat.values.iter().flat_map(|s| [s.mean, s.sd, s.q05, s.q95]).collect(),
+        };
+        self.send(key, &message, Delivery::Estimates);
+    }
+
     fn notice(&self, bed: &str, channels: &[&str], notice: &Notice) {
         let channel = notice.channel.and_then(|c| channels.get(c)).copied().unwrap_or_default();
-        let (kind, text) = (notice.kind.name(), notice.kind.text());
+        let (kind, text) = (notice.kind.name(), notice_text(&self.model, notice.kind));
         tracing::info!(bed, kind, channel, time_s = notice.time.as_s(), "{text}");
         let key = self.key(bed, "event");
         let header = self.header(&key, notice.time);
@@ -186,7 +212,9 @@ impl Sink for Outlet {
             match output {
                 Output::Estimate(estimate) => self.estimate(bed, estimate),
                 Output::Notice(notice) => self.notice(&bed.name, &channels, notice),
-                Output::Smoothed(_) | Output::Beat(_) | Output::Window(_) => {}
+                Output::Smoothed(estimate) => self.smoothed(bed, estimate),
+                Output::Beat(beat) => self.beat(bed, beat),
+                Output::Window(_) => {}
             }
         }
         if let Some(health) = health {
@@ -257,8 +285,10 @@ fn to_json(key: &str, payload: &[u8]) -> Option<Vec<u8>> {
         let message: T = wire::decode(payload, Encoding::Bincode).ok()?;
         Some(message.to_json().to_string().into_bytes())
     }
-    if key.ends_with("/estimate/state") {
+    if key.ends_with("/estimate/state") || key.ends_with("/estimate/smoothed") {
         twin::<StateEstimate>(payload)
+    } else if key.ends_with("/estimate/beat") {
+        twin::<BeatEstimate>(payload)
     } else if key.ends_with("/estimate/parameters") {
         twin::<ParameterEstimate>(payload)
     } else if key.ends_with("/estimate/members") {
@@ -276,23 +306,36 @@ fn count(n: usize) -> u32 {
     u32::try_from(n).unwrap_or(u32::MAX)
 }
 
+/// What happened, for people: with the name of the parameter, which the core does not write.
+#[must_use]
+pub fn notice_text(model: &Circulation, kind: NoticeKind) -> String {
+    match kind {
+        NoticeKind::ParameterShift(p) => format!("{} has begun to move", model.parameters()[p].name),
+        other => other.text(),
+    }
+}
+
+fn state_statistics(s: &Summary) -> [f64; 7] {
+    [s.mean, s.sd, s.epistemic_sd, s.aleatoric_sd, s.model_sd, s.q05, s.q95]
+}
+
 /// One published time as a message.
 fn state_message(header: Header, model: &Circulation, estimate: &Estimate) -> StateEstimate {
-    let row = |s: &Summary| [s.mean, s.sd, s.epistemic_sd, s.aleatoric_sd, s.model_sd, s.q05, s.q95];
     StateEstimate {
         header,
         members: count(estimate.members),
         times_ns: vec![estimate.time.0],
         since_data_s: vec![s_from_ns(estimate.since_data_ns)],
         names: model.states().iter().chain(model.derived()).map(|q| q.name.to_owned()).collect(),
-        values: estimate.quantities.iter().flat_map(row).collect(),
+        values: estimate.quantities.iter().flat_map(state_statistics).collect(),
     }
 }
 
 fn parameter_message(header: Header, model: &Circulation, estimate: &Estimate) -> ParameterEstimate {
     let row = |(p, since): &(crate::estimate::ensemble::ParameterSummary, i64)| {
         let s = &p.summary;
-        [s.mean, s.sd, s.q05, s.q95, p.identifiability, s_from_ns(*since)]
+        let identifiable = if p.is_identifiable() { 1.0 } else { 0.0 };
+        [s.mean, s.sd, s.q05, s.q95, p.identifiability, s_from_ns(*since), identifiable]
     };
     let name = |p: usize| model.parameters()[p].name.to_owned();
     ParameterEstimate {
@@ -315,7 +358,17 @@ fn status_message(header: Header, model: &Circulation, health: &Health) -> Statu
         last_sample_ns: c.last_sample.map_or(0, |t| t.0),
         samples_used: c.samples_used,
         innovation_rms: c.innovation_rms,
+        noise_sd: c.noise_sd_mmhg,
+        whiteness: c.whiteness,
+        recurrence: c.recurrence,
+        misfit: c.misfit,
+        artefact: c.artefact.map_or("", Artefact::name).to_owned(),
     };
+    let disagreement = health.disagreement.iter().flat_map(|(disagreement, estimated)| {
+        let states = model.states().iter().map(|q| q.name).zip(&disagreement.states);
+        let parameters = estimated.iter().map(|p| model.parameters()[*p].name).zip(&disagreement.parameters);
+        states.chain(parameters).map(|(name, apart)| (name.to_owned(), *apart))
+    });
     Status {
         header,
         members_alive: count(health.members_alive),
@@ -331,5 +384,6 @@ fn status_message(header: Header, model: &Circulation, health: &Health) -> Statu
         queue_depth: count(health.queue_depth),
         counters: health.counters.iter().map(|(cause, n)| ((*cause).to_owned(), *n)).collect(),
         channels: health.channels.iter().map(channel).collect(),
+        disagreement: disagreement.collect(),
     }
 }

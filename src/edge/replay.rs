@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use super::bus::{Bus, BusError, Delivery, Encoding, Message};
 use super::config::{Config, ConfigError};
-use super::files::csv::{CsvError, RecordReader, Row};
+use super::files::csv::Row;
+use super::files::record::{Record, RecordError};
 use super::synthetic::SyntheticPatient;
 use super::wire::{self, FLAG_LAST_BLOCK, PressureBlock, SCHEMA, ToJson, Truth, WireError};
 use crate::estimate::time::{EventTime, ns_from_s, s_from_ns};
@@ -25,7 +26,7 @@ const LISTENER_LOOKS: u32 = 100;
 pub enum ReplayError {
     /// The record.
     #[error(transparent)]
-    Record(#[from] CsvError),
+    Record(#[from] RecordError),
     /// The patient's start.
     #[error(transparent)]
     Config(#[from] ConfigError),
@@ -82,7 +83,7 @@ pub enum Source {
         /// Where it is.
         path: std::path::PathBuf,
         /// Where it stands.
-        reader: Box<RecordReader>,
+        reader: Box<Record>,
         /// Added to the times of this pass \[ns\].
         shift_ns: i64,
         /// Time of the first row, and of the latest \[ns\].
@@ -103,8 +104,8 @@ impl Source {
     ///
     /// # Errors
     /// When it cannot be read.
-    pub fn record(path: &std::path::Path, config: &Config) -> Result<Self, CsvError> {
-        let reader = Box::new(RecordReader::open(path, config)?);
+    pub fn record(path: &std::path::Path, config: &Config) -> Result<Self, RecordError> {
+        let reader = Box::new(Record::open(path, config)?);
         Ok(Self::Record { path: path.to_owned(), reader, shift_ns: 0, span: None })
     }
 }
@@ -175,7 +176,7 @@ impl Bed {
                     None if !options.repeat => return Ok(false),
                     None => {
                         let (first, last) = span.unwrap_or((0, 0));
-                        **reader = RecordReader::open(path, config)?;
+                        **reader = Record::open(path, config)?;
                         let Some(row) = reader.next_row()? else { return Ok(false) };
                         // The next pass begins one typical spacing after the last row.
                         *shift_ns += last - first + ns_from_s(1.0 / options.rate_hz);

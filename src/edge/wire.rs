@@ -1,4 +1,4 @@
-//! Wire schema v1: what crosses the bus, in bincode and in JSON.
+//! Wire schema v2: what crosses the bus, in bincode and in JSON.
 //!
 //! Bincode 2 with fixed-size little-endian integers and no framing, so that `struct` and `numpy.frombuffer` read
 //! it: integers and floats are their bytes, a `Vec` or `String` is a `u64` length and its elements, fields follow
@@ -7,9 +7,12 @@
 //! | key under `PREFIX/BED/` | type | |
 //! |---|---|---|
 //! | `pressure/CHANNEL` | [`PressureBlock`] | in; JSON accepted with encoding `application/json` |
+//! | `beat` | [`Beats`] | in: onsets of beats, from an ECG |
 //! | `truth` | [`Truth`] | what a synthetic patient really is; published by `replay` |
 //! | `estimate/state` | [`StateEstimate`] | |
 //! | `estimate/parameters` | [`ParameterEstimate`] | |
+//! | `estimate/smoothed` | [`StateEstimate`] | states and parameters, corrected by what came in the smoothing lag |
+//! | `estimate/beat` | [`BeatEstimate`] | once per heart beat |
 //! | `estimate/members` | [`Members`] | only while someone subscribes |
 //! | `status` | [`Status`] | |
 //! | `event` | [`Event`] | |
@@ -23,7 +26,7 @@ use serde_json::{Map, Value, json};
 use super::bus::Encoding;
 
 /// Version of everything in this module.
-pub const SCHEMA: u16 = 1;
+pub const SCHEMA: u16 = 2;
 
 /// Longest payload that is decoded \[bytes\]; also bounds what a corrupt length can allocate.
 pub const MAX_PAYLOAD_BYTES: usize = 1 << 20;
@@ -35,7 +38,11 @@ pub const FLAG_LAST_BLOCK: u32 = 1;
 pub const STATE_STATISTICS: [&str; 7] = ["mean", "sd", "epistemic_sd", "aleatoric_sd", "model_sd", "q05", "q95"];
 
 /// Statistics per parameter in [`ParameterEstimate::values`], in order.
-pub const PARAMETER_STATISTICS: [&str; 6] = ["mean", "sd", "q05", "q95", "identifiability", "since_informed_s"];
+pub const PARAMETER_STATISTICS: [&str; 7] =
+    ["mean", "sd", "q05", "q95", "identifiability", "since_informed_s", "identifiable"];
+
+/// Statistics per quantity in [`BeatEstimate::values`], in order.
+pub const BEAT_STATISTICS: [&str; 4] = ["mean", "sd", "q05", "q95"];
 
 /// A block of samples of one channel.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -55,6 +62,15 @@ pub struct PressureBlock {
     pub offsets_ns: Vec<i64>,
     /// Samples \[mmHg\].
     pub values: Vec<f64>,
+}
+
+/// Onsets of heart beats, told by somebody who knows.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Beats {
+    /// [`SCHEMA`].
+    pub schema: u16,
+    /// Event times at which the ventricles began to contract \[ns\].
+    pub onsets_ns: Vec<i64>,
 }
 
 /// What every published message starts with.
@@ -98,7 +114,25 @@ pub struct ParameterEstimate {
     pub members: u32,
     /// Names of the parameters.
     pub names: Vec<String>,
-    /// `[names x 6]`, the [`PARAMETER_STATISTICS`] of each.
+    /// `[names x 7]`, the [`PARAMETER_STATISTICS`] of each; `identifiable` is 1 where data rather than settings say what
+    /// the value is, else 0.
+    pub values: Vec<f64>,
+}
+
+/// A heart beat that is over.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct BeatEstimate {
+    /// Common start; its time is the onset.
+    pub header: Header,
+    /// Members that took part.
+    pub members: u32,
+    /// Event time at which the next beat began \[ns\].
+    pub end_ns: i64,
+    /// Names of the clinical quantities.
+    pub names: Vec<String>,
+    /// Their units.
+    pub units: Vec<String>,
+    /// `[names x 4]`, the [`BEAT_STATISTICS`] of each.
     pub values: Vec<f64>,
 }
 
@@ -126,6 +160,16 @@ pub struct ChannelStatus {
     pub samples_used: u64,
     /// Root mean square of the normalised innovations, lately: 1 when model and noise fit.
     pub innovation_rms: f64,
+    /// Noise that the sensor is taken to have \[mmHg\].
+    pub noise_sd: f64,
+    /// Mean square of sums of neighbouring innovations: 1 when the model fits, more when it is off for a while.
+    pub whiteness: f64,
+    /// Mean square of innovations laid over each other beat by beat: 1 when the model fits.
+    pub recurrence: f64,
+    /// Whether the model no longer fits this channel.
+    pub misfit: bool,
+    /// Why the channel is set aside; empty if it is not.
+    pub artefact: String,
 }
 
 /// Health of a bed, once a second.
@@ -159,6 +203,8 @@ pub struct Status {
     pub counters: Vec<(String, u64)>,
     /// Channels that are observed or configured to be.
     pub channels: Vec<ChannelStatus>,
+    /// How far a second filter is from the estimates, by name, in units of both sd together; empty without one.
+    pub disagreement: Vec<(String, f64)>,
 }
 
 /// Something happened.
@@ -322,11 +368,32 @@ impl ToJson for ParameterEstimate {
         let k = PARAMETER_STATISTICS.len();
         let parameter = |p: usize| -> Map<String, Value> {
             let value = |s: usize| self.values.get(p * k + s).copied().unwrap_or(f64::NAN);
-            PARAMETER_STATISTICS.iter().enumerate().map(|(s, name)| ((*name).to_owned(), json!(value(s)))).collect()
+            let entry = |(s, name): (usize, &&str)| {
+                let value = if *name == "identifiable" { json!(value(s) > 0.5) } else { json!(value(s)) };
+                ((*name).to_owned(), value)
+            };
+            PARAMETER_STATISTICS.iter().enumerate().map(entry).collect()
         };
         let parameters: Map<String, Value> =
             self.names.iter().enumerate().map(|(p, name)| (name.clone(), Value::Object(parameter(p)))).collect();
         with_header(&self.header, json!({ "members": self.members, "names": self.names, "parameters": parameters }))
+    }
+}
+
+impl ToJson for BeatEstimate {
+    fn to_json(&self) -> Value {
+        let k = BEAT_STATISTICS.len();
+        let quantity = |q: usize| -> Map<String, Value> {
+            let value = |s: usize| self.values.get(q * k + s).copied().unwrap_or(f64::NAN);
+            let statistics = BEAT_STATISTICS.iter().enumerate().map(|(s, name)| ((*name).to_owned(), json!(value(s))));
+            statistics.chain([("unit".to_owned(), json!(self.units.get(q)))]).collect()
+        };
+        let quantities: Map<String, Value> =
+            self.names.iter().enumerate().map(|(q, name)| (name.clone(), Value::Object(quantity(q)))).collect();
+        with_header(
+            &self.header,
+            json!({ "members": self.members, "end_ns": self.end_ns, "names": self.names, "quantities": quantities }),
+        )
     }
 }
 
@@ -343,6 +410,7 @@ impl ToJson for Status {
         if let Value::Object(map) = &mut body {
             map.remove("header");
             map.insert("counters".into(), self.counters.iter().cloned().map(|(k, v)| (k, json!(v))).collect());
+            map.insert("disagreement".into(), self.disagreement.iter().cloned().map(|(k, v)| (k, json!(v))).collect());
         }
         with_header(&self.header, body)
     }

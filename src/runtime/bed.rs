@@ -6,7 +6,9 @@ use hdrhistogram::Histogram;
 
 use super::clock::Clock;
 use crate::estimate::ensemble::Parallel;
-use crate::estimate::estimator::{ChannelHealth, Estimator, Input, Notice, NoticeKind, Output, REPORT_EVERY_NS};
+use crate::estimate::estimator::{
+    ChannelHealth, Disagreement, Estimator, Input, Notice, NoticeKind, Output, REPORT_EVERY_NS,
+};
 use crate::estimate::time::{ArrivalTime, EventTime, s_from_ns};
 use crate::estimate::window::{Liveness, RawSample};
 use crate::model::discrepancy::Circulation;
@@ -31,6 +33,8 @@ pub enum Task {
         /// The samples.
         samples: Vec<RawSample>,
     },
+    /// Onsets of heart beats.
+    Beats(Vec<EventTime>),
     /// Something came that the edge could not make sense of.
     Refused(&'static str),
     /// Time has passed.
@@ -79,6 +83,8 @@ pub struct Health {
     pub counters: BTreeMap<&'static str, u64>,
     /// The channels.
     pub channels: Vec<ChannelHealth>,
+    /// How far a second filter is from the ensemble, and the parameters that are estimated; None without one.
+    pub disagreement: Option<(Disagreement, Vec<usize>)>,
 }
 
 /// A bed.
@@ -153,6 +159,7 @@ impl Bed {
                 }
             }
             Task::Refused(cause) => self.refuse(cause, arrived, out),
+            Task::Beats(onsets) => self.drive(Input::Beats(onsets), arrived, parallel, out),
             Task::Tick => self.drive(Input::Tick, arrived, parallel, out),
             Task::Report { want_members, queue_depth, queue_full, inlet_full } => {
                 self.drive(Input::WantMembers(want_members), arrived, parallel, out);
@@ -244,6 +251,7 @@ impl Bed {
             queue_depth,
             counters,
             channels: self.estimator.channels(),
+            disagreement: self.estimator.disagreement().map(|apart| (apart, self.estimator.estimated().to_vec())),
         }
     }
 }

@@ -86,7 +86,7 @@ impl Daemon {
         let (service, inlet) =
             Service::new(config.circulation().unwrap(), settings, limits, workers, sink, Clock::start()).unwrap();
         let service = tokio::spawn(service.run());
-        subscriptions.push(inlet::listen(&bus, config, inlet.clone()).unwrap());
+        subscriptions.extend(inlet::listen(&bus, config, inlet.clone()).unwrap());
         Self { bus, inlet, outlet, service, said, subscriptions }
     }
 
@@ -293,7 +293,7 @@ fn bad_messages() -> Vec<(String, Bad)> {
         bytes("a length beyond memory", "malformed", huge_length),
         bytes("a million samples", "oversized", raw_bytes(1, &vec![80.0; 1_000_000])),
         bytes("too many samples", "oversized", raw_bytes(1, &vec![80.0; 16_385])),
-        with("another version", "wrong_schema", 1, PressureBlock { schema: 2, ..base.clone() }),
+        with("another version", "wrong_schema", 1, PressureBlock { schema: 3, ..base.clone() }),
         with("NaN", "not_finite", 2, values(f64::NAN)),
         with("infinite", "not_finite", 2, values(f64::INFINITY)),
         with("minus infinite", "not_finite", 2, values(f64::NEG_INFINITY)),
@@ -317,7 +317,7 @@ fn bad_messages() -> Vec<(String, Bad)> {
         ),
         with("an hour ahead", "clock_jump", 10, PressureBlock { start_ns: 3_600_000 * MS, ..base.clone() }),
         ("unknown channel", "unknown_channel", 1, "spirit_level", Encoding::Bincode, good.clone()),
-        json("JSON garbage", "malformed", "{\"schema\": 1, \"values\": [80"),
+        json("JSON garbage", "malformed", "{\"schema\": 2, \"values\": [80"),
         json("no JSON", "malformed", "\u{0}\u{1}"),
         json("JSON of something else", "malformed", "[1, 2, 3]"),
         json("JSON of another version", "wrong_schema", "{\"schema\": 7}"),

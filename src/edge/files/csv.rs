@@ -5,6 +5,7 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use crate::edge::config::Config;
+use crate::estimate::beat::BeatEstimate;
 use crate::estimate::ensemble::ParameterSummary;
 use crate::estimate::estimator::Estimate;
 use crate::estimate::statistics::Summary;
@@ -237,6 +238,21 @@ pub fn estimate_row(estimate: &Estimate) -> Vec<f64> {
         .chain(estimate.quantities.iter().flat_map(quantity))
         .chain(estimate.parameters.iter().flat_map(parameter))
         .collect()
+}
+
+/// Header of a table of beats: onset, end, four statistics per clinical quantity.
+#[must_use]
+pub fn beat_header(model: &Circulation) -> Vec<String> {
+    let statistics = |name: &'static str| ["mean", "sd", "q05", "q95"].map(|s| format!("{name}_{s}"));
+    let quantities = model.clinical().iter().flat_map(|q| statistics(q.name));
+    ["time_s", "end_s"].into_iter().map(str::to_owned).chain(quantities).collect()
+}
+
+/// A row of a table of beats.
+#[must_use]
+pub fn beat_row(beat: &BeatEstimate) -> Vec<f64> {
+    let quantities = beat.values.iter().flat_map(|s| [s.mean, s.sd, s.q05, s.q95]);
+    [beat.start.as_s(), beat.end.as_s()].into_iter().chain(quantities).collect()
 }
 
 /// Header of a truth file: `time_s`, pressures, flows, volumes, and the parameters that change.

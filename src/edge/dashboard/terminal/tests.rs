@@ -87,6 +87,11 @@ fn status(bed: &str, time_ns: i64) -> Message {
         last_sample_ns: time_ns - 3000 * MS,
         samples_used: 1234,
         innovation_rms,
+        noise_sd: 2.0,
+        whiteness: 1.0,
+        recurrence: 1.0,
+        misfit: false,
+        artefact: String::new(),
     };
     let status = Status {
         header: header(time_ns),
@@ -103,6 +108,7 @@ fn status(bed: &str, time_ns: i64) -> Message {
         queue_depth: 5,
         counters: vec![("late".to_owned(), 42)],
         channels: vec![channel("p_a", "live", 1.04), channel("p_v", "silent", 2.5)],
+        disagreement: Vec::new(),
     };
     message(&format!("ward/{bed}/status"), &status)
 }

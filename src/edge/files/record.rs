@@ -1,0 +1,126 @@
+//! A record of pressures, whatever the format: rows in order of time.
+
+use std::path::Path;
+
+use super::csv::{CsvError, RecordReader, Row};
+use super::wfdb::{self, WfdbError};
+use crate::edge::config::Config;
+use crate::estimate::time::EventTime;
+use crate::model::cvsim6::Pressures;
+
+/// A record that cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// CSV.
+    #[error(transparent)]
+    Csv(#[from] CsvError),
+    /// WFDB.
+    #[error(transparent)]
+    Wfdb(#[from] WfdbError),
+    /// WFDB without anything to estimate from.
+    #[error("{path}: found the signals {found}, expected a pressure in mmHg under a label of the table [labels]")]
+    NoPressure {
+        /// The header.
+        path: std::path::PathBuf,
+        /// What is in it.
+        found: String,
+    },
+}
+
+/// A record, open at its start.
+pub enum Record {
+    /// Rows of a CSV file.
+    Csv(Box<RecordReader>),
+    /// Signals of a WFDB record.
+    Wfdb(WfdbRows),
+}
+
+impl Record {
+    /// Opens a record: WFDB if the path is that of a header, with or without its ending, otherwise CSV.
+    ///
+    /// # Errors
+    /// When it cannot be read or holds no pressure.
+    pub fn open(path: &Path, config: &Config) -> Result<Self, RecordError> {
+        let is_header = path.extension().is_some_and(|ending| ending == "hea");
+        if is_header || (!path.exists() && path.with_added_extension("hea").exists()) {
+            Ok(Self::Wfdb(WfdbRows::open(path, config)?))
+        } else {
+            Ok(Self::Csv(Box::new(RecordReader::open(path, config)?)))
+        }
+    }
+
+    /// The state that each value of a row belongs to.
+    #[must_use]
+    pub fn states(&self) -> &[usize] {
+        match self {
+            Self::Csv(reader) => reader.states(),
+            Self::Wfdb(rows) => &rows.states,
+        }
+    }
+
+    /// The next row; None at the end.
+    ///
+    /// # Errors
+    /// When it cannot be read on.
+    pub fn next_row(&mut self) -> Result<Option<Row>, RecordError> {
+        match self {
+            Self::Csv(reader) => Ok(reader.next_row()?),
+            Self::Wfdb(rows) => Ok(rows.next_row()),
+        }
+    }
+}
+
+/// The pressures of a WFDB record, side by side; each has its own rate.
+pub struct WfdbRows {
+    states: Vec<usize>,
+    signals: Vec<Samples>,
+}
+
+struct Samples {
+    rate_hz: f64,
+    /// \[mmHg\]; NaN where missing.
+    values: Vec<f64>,
+    next: usize,
+}
+
+impl Samples {
+    #[allow(clippy::cast_precision_loss)]
+    fn next_time(&self) -> Option<EventTime> {
+        (self.next < self.values.len()).then(|| EventTime::from_s(self.next as f64 / self.rate_hz))
+    }
+}
+
+impl WfdbRows {
+    fn open(path: &Path, config: &Config) -> Result<Self, RecordError> {
+        let record = wfdb::Record::open(path)?;
+        let (mut states, mut signals) = (Vec::new(), Vec::new());
+        for (index, signal) in record.signals.iter().enumerate() {
+            let state = config.state_of_label(&signal.name);
+            let state = state.and_then(|name| Pressures::NAMES.iter().position(|known| *known == name));
+            let Some(state) = state.filter(|_| signal.units.eq_ignore_ascii_case("mmHg")) else { continue };
+            if states.contains(&state) {
+                tracing::warn!("{}: another signal of {} is ignored", signal.name, Pressures::NAMES[state]);
+                continue;
+            }
+            states.push(state);
+            signals.push(Samples { rate_hz: signal.rate_hz, values: record.samples(index)?, next: 0 });
+        }
+        if states.is_empty() {
+            let names: Vec<String> = record.signals.iter().map(|s| format!("{} [{}]", s.name, s.units)).collect();
+            return Err(RecordError::NoPressure { path: path.to_owned(), found: names.join(", ") });
+        }
+        Ok(Self { states, signals })
+    }
+
+    fn next_row(&mut self) -> Option<Row> {
+        let time = self.signals.iter().filter_map(Samples::next_time).min()?;
+        let values = self.signals.iter_mut().map(|signal| {
+            if signal.next_time() != Some(time) {
+                return None;
+            }
+            signal.next += 1;
+            Some(signal.values[signal.next - 1]).filter(|value| !value.is_nan())
+        });
+        Some(Row { time, values: values.collect() })
+    }
+}
