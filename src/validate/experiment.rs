@@ -8,6 +8,7 @@ use super::twin::{Event, Outcome, QuantityScore, Record, RecordError, Stream, Wa
 use crate::edge::config::{Config, Coupling};
 use crate::estimate::ensemble::{Parallel, Serial};
 use crate::estimate::time::ns_from_s;
+use crate::model::cvsim6::Pressures;
 use crate::runtime::workers::Workers;
 
 /// Until here nothing is scored \[s\]; of a short run the first quarter.
@@ -39,6 +40,12 @@ struct Case {
     /// Index of the patient.
     patient: usize,
     seed: u64,
+}
+
+/// What all methods made of one case; the trace of the first seed.
+struct Told {
+    rows: Vec<Row>,
+    trace: Option<Trace>,
 }
 
 /// What one method made of one case.
@@ -103,30 +110,25 @@ impl Plan {
             }
         }
         // Many cases side by side keep the threads busier than the members of one; few leave some idle.
-        let done: Vec<Result<(Vec<Row>, Option<Trace>), ValidateError>> = if cases.len() >= workers.threads() {
+        let done: Vec<Result<Told, ValidateError>> = if cases.len() >= workers.threads() {
             workers.map(&cases, |case| self.case(*case, &Serial, second))
         } else {
             cases.iter().map(|case| self.case(*case, workers, second)).collect()
         };
-        let mut results = Results { seconds: self.seconds, from_s: self.from_s(), ..Results::default() };
+        let mut results = Results { seconds: self.seconds, from_s: self.scored_from_s(), ..Results::default() };
         for one in done {
-            let (rows, trace) = one?;
+            let Told { rows, trace } = one?;
             results.rows.extend(rows);
             results.traces.extend(trace);
         }
         Ok(results)
     }
 
-    fn from_s(&self) -> f64 {
+    fn scored_from_s(&self) -> f64 {
         SCORED_FROM_S.min(0.25 * self.seconds)
     }
 
-    fn case(
-        &self,
-        case: Case,
-        parallel: &dyn Parallel,
-        second: &(dyn Fn() + Sync),
-    ) -> Result<(Vec<Row>, Option<Trace>), ValidateError> {
+    fn case(&self, case: Case, parallel: &dyn Parallel, second: &(dyn Fn() + Sync)) -> Result<Told, ValidateError> {
         let Case { scenario, seed, .. } = case;
         let TwinPatient { name, config: patient } = &self.patients[case.patient];
         let own = seed_of(name, seed);
@@ -138,7 +140,7 @@ impl Plan {
             RecordError::Simulation(source) => ValidateError::Simulation { patient: name.clone(), source },
         })?;
 
-        let (from_s, step_s) = (self.from_s(), scenario.step_s(self.seconds));
+        let (from_s, step_s) = (self.scored_from_s(), scenario.step_s(self.seconds));
         let mut rows = Vec::new();
         let mut told = Vec::new();
         let rivals = self.rivals.iter().map(|rival| ([rival.name(); 2], rival.of(&belief)));
@@ -162,7 +164,7 @@ impl Plan {
         let samples =
             samples.flat_map(|(time, values)| observed.iter().map(|&s| (s, time.as_s(), values[s]))).collect();
         let trace = (seed == 0).then(|| Trace { scenario, patient: name.clone(), told, samples });
-        Ok((rows, trace))
+        Ok(Told { rows, trace })
     }
 
     /// Parameters all the time, states at the end.
@@ -172,7 +174,7 @@ impl Plan {
             let from = series.points.partition_point(|point| point.time_s < self.seconds - SHOWN_S);
             Series { points: series.points[from..].to_vec(), ..*series }
         };
-        let states = crate::model::cvsim6::Pressures::NAMES.iter().filter_map(|name| outcome.series(stream, name));
+        let states = Pressures::NAMES.iter().filter_map(|name| outcome.series(stream, name));
         (parameters.collect(), states.map(late).collect())
     }
 }

@@ -13,7 +13,7 @@ pub const HEADING: &str = "# Twin experiments\n\n\
     Synthetic patients whose truth is known, watched through noisy sensors at 125 Hz; the estimator starts with the \
     parameters to be found 30 % wrong and pressures 4 % uncertain, and `r_pv` and `c_a` wander by 1 % per square root of a \
     second. The filters of the textbooks (UKF, EnKF) get the same samples, with the constant process noise that suits them \
-    best. Errors, widths and CRPS are in per cent of the root mean square of the truth. Every number is in `scores.csv`, \
+    best. Errors, widths and CRPS are in per cent of the root mean square of the truth. A closed valve is a sure zero, which counts as within both bands of its flow. Every number is in `scores.csv`, \
     what the estimators had to report in `events.csv`, medians over runs in `summary.json`.\n\n";
 
 /// Colours of the methods, in their order.
@@ -160,10 +160,10 @@ fn pressures(report: &mut Report, trace: &Trace) {
     for (s, series) in states.iter().enumerate() {
         let read: Vec<(f64, f64)> =
             trace.samples.iter().filter(|(state, ..)| *state == s).map(|&(_, t, value)| (t, value)).collect();
-        let seen = if read.is_empty() { "no sensor" } else { "observed" };
+        let (seen, label) = if read.is_empty() { ("no sensor", "") } else { ("observed", "samples") };
         let title = format!("{} ({seen})", Pressures::NAMES[s]);
         let chart = Chart::new(title, "t [s]", format!("{} [{}]", series.name, series.unit))
-            .points("samples", read, Colour::Grey)
+            .points(label, read, Colour::Grey)
             .band(&format!("{method}, 5-95 %"), band(series), Colour::Blue)
             .line(method, line(series, |p| p.mean), Colour::Blue)
             .dashed("truth", line(series, |p| p.truth), Colour::Black);

@@ -10,9 +10,11 @@ use super::score::{Score, mean_of_numbers, median};
 /// A share of times in a 90 % band that one run after the other can have by chance \[%\].
 const HONEST: std::ops::RangeInclusive<f64> = 80.0..=98.0;
 
-/// Width of a number in the table on the terminal, and of the first column.
-const CELL: usize = 6;
+/// Columns of a terminal, and those of the names.
+const TERMINAL: usize = 120;
 const NAME: usize = 15;
+/// Columns of a number, where there is room.
+const CELL: usize = 8;
 
 /// One quantity over all runs of one method in one scenario; see [`Score`] for the units.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -46,9 +48,23 @@ pub struct Overview {
     pub runs: usize,
     /// Name, and a cell per method, if it told anything of the quantity.
     pub quantities: Vec<(&'static str, Vec<Option<Cell>>)>,
-    /// Per method: kind and channel, number of runs in which it happened, median of its first time \[s\].
-    pub events: Vec<(&'static str, Vec<(String, usize, f64)>)>,
+    /// Per method.
+    pub events: Vec<(&'static str, Vec<Happened>)>,
 }
+
+/// An event over all runs of one method in one scenario.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Happened {
+    /// Kind and channel.
+    pub what: String,
+    /// Number of runs in which it happened.
+    pub runs: usize,
+    /// Median of its first time \[s\].
+    pub first_s: f64,
+}
+
+/// Something to be read off a cell.
+type Reading = fn(&Cell) -> f64;
 
 /// Appends what is new, in the order of first sight.
 fn note<T: PartialEq>(all: &mut Vec<T>, one: T) {
@@ -86,23 +102,33 @@ impl Overview {
         Self { scenario, methods, runs, quantities, events }
     }
 
-    /// For the terminal, at most 120 columns with four methods.
+    /// For the terminal.
     #[must_use]
     pub fn lines(&self) -> Vec<String> {
-        let width = CELL * self.methods.len();
-        let groups = ["RMSE %", "90 % covers %", "its width %", "CRPS %"];
-        let head: String = groups.iter().map(|group| format!(" {group:^width$}")).collect();
-        let heading = format!("{}: {} ({} runs)", self.scenario.name(), self.scenario.about(), self.runs);
-        let mut lines = vec![heading, format!("{:NAME$}{head}", "").trim_end().to_owned()];
-        let methods: String = self.methods.iter().map(|method| format!("{:>CELL$}", abbreviated(method))).collect();
-        lines.push(format!("{:NAME$}{}", "", [" ", &methods].concat().repeat(groups.len())));
+        let groups: [(&str, Reading); 4] = [
+            ("RMSE %", |c| c.rmse),
+            ("90 % band covers %", |c| c.coverage_90),
+            ("its width %", |c| c.width_90),
+            ("CRPS %", |c| c.crps),
+        ];
+        let room = (TERMINAL - NAME) / groups.len() - 1;
+        let cell = CELL.min(room / self.methods.len().max(1));
+        let width = cell * self.methods.len();
+        let heads: String = groups.iter().map(|(head, _)| format!(" {head:^width$}")).collect();
+        let names: String = self.methods.iter().map(|method| format!("{:>cell$}", abbreviated(method, cell))).collect();
+        let mut lines = vec![
+            format!("{}: {} ({} runs)", self.scenario.name(), self.scenario.about(), self.runs),
+            format!("{:NAME$}{heads}", "").trim_end().to_owned(),
+            format!("{:NAME$}{}", "", format!(" {names}").repeat(groups.len())),
+        ];
         for (name, cells) in &self.quantities {
-            let group = |of: fn(&Cell) -> f64| {
-                let numbers = cells.iter().map(|cell| cell.as_ref().map_or_else(String::new, |cell| compact(of(cell))));
-                numbers.map(|number| format!("{number:>CELL$}")).collect::<String>()
+            let number = |told: &Option<Cell>, of: Reading| {
+                let number = told.as_ref().map_or_else(String::new, |told| compact(of(told)));
+                format!("{number:>cell$}")
             };
-            let groups = [group(|c| c.rmse), group(|c| c.coverage_90), group(|c| c.width_90), group(|c| c.crps)];
-            lines.push(format!("{name:NAME$} {}", groups.join(" ")));
+            let group = |of| cells.iter().map(|told| number(told, of)).collect::<String>();
+            let row: String = groups.iter().map(|(_, of)| format!(" {}", group(*of))).collect();
+            lines.push(format!("{name:NAME$}{row}"));
         }
         lines
     }
@@ -118,7 +144,7 @@ impl Overview {
                 .iter()
                 .filter_map(|(name, cells)| Some((*name, cells[0].as_ref()?, cells[k].as_ref()?)))
                 .collect();
-            let at_or_below = |of: fn(&Cell) -> f64| {
+            let at_or_below = |of: Reading| {
                 // Not below: also what is no number.
                 let above = pairs.iter().filter(|(_, a, b)| !matches!(of(a).partial_cmp(&of(b)), Some(o) if o.is_le()));
                 above.map(|(name, ..)| *name).collect::<Vec<_>>()
@@ -175,9 +201,9 @@ impl Overview {
     pub fn notices(&self) -> Vec<String> {
         let mut lines = Vec::new();
         for (method, events) in &self.events {
-            let told = events.iter().filter(|(what, ..)| what != "start");
+            let told = events.iter().filter(|event| event.what != "start");
             let told: Vec<String> = told
-                .map(|(what, runs, first)| format!("{what} in {runs} runs, first at {} s", compact(*first)))
+                .map(|event| format!("{} in {} runs, first at {} s", event.what, event.runs, compact(event.first_s)))
                 .collect();
             if !told.is_empty() {
                 lines.push(format!("events of {method}: {}", told.join("; ")));
@@ -204,7 +230,7 @@ impl Cell {
     }
 }
 
-fn events(rows: &[&Row], method: &str) -> Vec<(String, usize, f64)> {
+fn events(rows: &[&Row], method: &str) -> Vec<Happened> {
     let name = |kind: &str, channel: Option<&str>| channel.map_or(kind.to_owned(), |c| format!("{kind} ({c})"));
     let told: Vec<(String, f64)> = rows
         .iter()
@@ -213,21 +239,17 @@ fn events(rows: &[&Row], method: &str) -> Vec<(String, usize, f64)> {
         .collect();
     let mut names = Vec::new();
     told.iter().for_each(|(name, _)| note(&mut names, name.clone()));
-    let sum = |name: String| {
-        let times: Vec<f64> = told.iter().filter(|(other, _)| *other == name).map(|(_, time)| *time).collect();
-        (name, times.len(), median(times.into_iter()))
+    let sum = |what: String| {
+        let times: Vec<f64> = told.iter().filter(|(other, _)| *other == what).map(|(_, time)| *time).collect();
+        Happened { what, runs: times.len(), first_s: median(times.into_iter()) }
     };
     names.into_iter().map(sum).collect()
 }
 
-/// Fits a narrow column.
-fn abbreviated(method: &str) -> &str {
-    match method {
-        "coupled_smoothed" | "independent_smoothed" => "later",
-        "independent" => "indep",
-        "coupled" => "coupl",
-        other => other,
-    }
+/// Fits a column: what is looked back at is named by the option that asks for it.
+fn abbreviated(method: &str, width: usize) -> &str {
+    let short = if method.ends_with("_smoothed") { "lag" } else { method };
+    short.get(..width - 1).unwrap_or(short)
 }
 
 /// Three digits that count.

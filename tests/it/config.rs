@@ -51,7 +51,7 @@ fn fixtures(kind: &str) -> Vec<PathBuf> {
 }
 
 fn presets() -> Vec<PathBuf> {
-    ["config/default.toml", "config/paper.toml", "config/patients/pulmonary_hypertension.toml"]
+    ["config/default.toml", "config/paper.toml", "config/validate.toml", "config/patients/pulmonary_hypertension.toml"]
         .map(in_repository)
         .into()
 }
