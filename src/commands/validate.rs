@@ -38,9 +38,9 @@ Examples:
   hemostream validate --patient hemorrhage --patient my_patient.toml --rival none --observed p_a
   hemostream validate --quick --set estimator.members=50
 
-Patients: healthy, pulmonary_hypertension_stable, hemorrhage, vasodilation, left_failure, right_failure, tachycardia,
-or a TOML file whose [patient] and [channels] are the truth. --config and --set say what the estimator believes and how
-it works, and never change the truth.";
+Patients: healthy, pulmonary_hypertension_stable, hemorrhage, vasodilation, left_failure,
+right_failure, tachycardia, or a TOML file whose [patient] and [channels] are the truth.
+--config and --set say what the estimator believes and how it works; the truth stays as it is.";
 
 /// Twin experiments: synthetic patients with a known truth; error, bands and CRPS beside the UKF and the EnKF
 #[derive(Args)]

@@ -22,7 +22,7 @@ const RIVAL_DRIFT: (f64, f64) = (0.05, 0.001);
 /// and `c_a` wander, and the patient starts somewhere in the stated spread of the initial pressures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Scenario {
-    /// The pulmonary resistance rises at once half way; everything else that is believed is true.
+    /// The pulmonary resistance jumps to 1.5 times that of the start half way; everything else that is believed is true.
     Step,
     /// Nothing happens.
     Steady,
@@ -76,7 +76,7 @@ impl Scenario {
     #[must_use]
     pub fn about(self) -> &'static str {
         match self {
-            Self::Step => "r_pv rises by half at once, half way; everything else that is believed is true",
+            Self::Step => "half way r_pv jumps to 1.5 times that of the start; what is believed of all else is true",
             Self::Steady => "nothing happens, and what is believed is true",
             Self::NonlinearResistance => "the true pulmonary resistance rises with the flow, the believed one does not",
             Self::WrongPTh => "the intrathoracic pressure is believed to be 0",

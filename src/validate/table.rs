@@ -10,6 +10,9 @@ use super::score::{Score, mean_of_numbers, median};
 /// A share of times in a 90 % band that one run after the other can have by chance \[%\].
 const HONEST: std::ops::RangeInclusive<f64> = 80.0..=98.0;
 
+/// Exceptions that are named in a line.
+const NAMED: usize = 6;
+
 /// Columns of a terminal, and those of the names.
 const TERMINAL: usize = 120;
 const NAME: usize = 15;
@@ -150,7 +153,11 @@ impl Overview {
                 above.map(|(name, ..)| *name).collect::<Vec<_>>()
             };
             let count = |above: &[&str]| {
-                let except = if above.is_empty() { String::new() } else { format!(" (not {})", above.join(", ")) };
+                let except = match above {
+                    [] => String::new(),
+                    few if few.len() <= NAMED => format!(" (not {})", few.join(", ")),
+                    many => format!(" (not {} and {} more)", many[..NAMED].join(", "), many.len() - NAMED),
+                };
                 format!("{} of {} quantities{except}", pairs.len() - above.len(), pairs.len())
             };
             lines.push(format!("RMSE of {own} at or below {other}: {}", count(&at_or_below(|c| c.rmse))));
