@@ -14,7 +14,7 @@ pub const HEADING: &str = "# Twin experiments\n\n\
     parameters to be found 30 % wrong and pressures 4 % uncertain, and `r_pv` and `c_a` wander by 1 % per square root of a \
     second. The filters of the textbooks (UKF, EnKF) get the same samples, with the constant process noise that suits them \
     best. Errors, widths and CRPS are in per cent of the root mean square of the truth. A closed valve is a sure zero, which counts as within both bands of its flow. The UKF \
-    has no members that live through a beat, only a cloud drawn anew in every window; its band of the cardiac output comes \
+    has no members that live through a beat, only a cloud placed anew in every window; its band of the cardiac output comes \
     from that cloud and is no claim of the filter's. Every number is in `scores.csv`, \
     what the estimators had to report in `events.csv`, medians over runs in `summary.json`.\n\n";
 
