@@ -21,8 +21,8 @@
 //!
 //! # Layers
 //!
-//! `model <- xtfc <- estimate <- runtime <- edge <- reproduce`: each knows those before it and nothing of those after it. The
-//! first three are pure: no clock, no socket, no thread, no log; a test checks it. Each module says what it
+//! `model <- xtfc <- estimate <- runtime <- edge <- report <- reproduce, validate`: each knows those before it and nothing
+//! of those after it, and the last two nothing of each other. The first three are pure: no clock, no socket, no thread, no log; a test checks it. Each module says what it
 //! guarantees and what is deliberately absent.
 //!
 //! # Where to add what
@@ -38,10 +38,14 @@
 //! | a topic | a type in [`edge::wire`], encoded in [`edge::outlet`] |
 //! | a command | a file in `src/commands` |
 //! | a study of the paper | a file in [`reproduce`], and its line in [`reproduce::STUDIES`] |
+//! | a patient to validate with | a file in `config/patients`, and its line in [`validate::patients`] |
+//! | something that an estimator may be told wrongly | a variant of [`validate::scenario::Scenario`] |
 
 pub mod edge;
 pub mod estimate;
 pub mod model;
+pub mod report;
 pub mod reproduce;
 pub mod runtime;
+pub mod validate;
 pub mod xtfc;

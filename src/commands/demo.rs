@@ -13,12 +13,10 @@ use hemostream::edge::config::{Config, ZenohMode, ZenohSettings};
 use hemostream::edge::dashboard::terminal;
 use hemostream::edge::replay::{Bed, ReplayOptions, Source, run, wait_for_listener};
 use hemostream::edge::scoreboard::Scoreboard;
+use hemostream::edge::synthetic::draw_start;
 use hemostream::edge::zenoh::ZenohBus;
 use hemostream::model::Model;
 use hemostream::model::cvsim6::Pressures;
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, StandardNormal};
 
 use super::serve::{Running, asked_to_stop, tokio_runtime};
 use super::simulate::positive;
@@ -38,9 +36,6 @@ const SETTINGS: &[&str] = &[
 ];
 
 const BED: &str = "demo";
-
-/// Which random numbers of the seed decide where the patient starts.
-const START_STREAM: u64 = 3;
 
 /// Messages that may wait for the scoreboard.
 const QUEUE: usize = 4096;
@@ -126,19 +121,8 @@ impl Demo {
 /// The patient starts somewhere in what the estimator is told of the start, and so with a blood volume that it does
 /// not know.
 fn patient(config: &Config) -> Result<Config, Failure> {
-    let mut rng = ChaCha8Rng::seed_from_u64(config.estimator.seed);
-    rng.set_stream(START_STREAM);
-    let mut drawn = config.patient.initial_pressures()?.into_iter().zip(config.patient.initial_sd()).map(|(p, sd)| {
-        let e: f64 = StandardNormal.sample(&mut rng);
-        Some(p + sd * e)
-    });
     let mut patient = config.clone();
-    let initial = &mut patient.patient.initial;
-    for pressure in
-        [&mut initial.p_l, &mut initial.p_a, &mut initial.p_v, &mut initial.p_r, &mut initial.p_pa, &mut initial.p_pv]
-    {
-        *pressure = drawn.next().flatten();
-    }
+    draw_start(&mut patient, config.estimator.seed)?;
     Ok(patient)
 }
 

@@ -7,6 +7,7 @@ mod replay;
 mod reproduce;
 mod serve;
 mod simulate;
+mod validate;
 mod watch;
 
 use std::io::{IsTerminal, Write};
@@ -40,6 +41,7 @@ enum Command {
     Watch(watch::Watch),
     Simulate(simulate::Simulate),
     Estimate(estimate::Estimate),
+    Validate(validate::Validate),
     Reproduce(reproduce::Reproduce),
     Config(config::ConfigCommand),
 }
@@ -137,6 +139,7 @@ pub(crate) fn main() -> ExitCode {
         Command::Watch(command) => command.run(),
         Command::Simulate(command) => command.run(),
         Command::Estimate(command) => command.run(),
+        Command::Validate(command) => command.run(),
         Command::Reproduce(command) => command.run(),
         Command::Config(command) => command.run(),
     };

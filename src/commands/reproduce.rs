@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use clap::Args;
 use clap::builder::PossibleValuesParser;
 use hemostream::estimate::time::s_from_ns;
-use hemostream::reproduce::{Context, HEADING, STUDIES, StudyError, report};
+use hemostream::report;
+use hemostream::reproduce::{Context, HEADING, STUDIES, StudyError};
 use hemostream::runtime::clock::Clock;
 use hemostream::runtime::workers::Workers;
 

@@ -16,6 +16,25 @@ const WANDER_STEP_S: f64 = 0.25;
 const SENSOR_STREAM: u64 = 1;
 const WANDER_STREAM: u64 = 2;
 
+/// Which random numbers of a seed decide where a patient starts.
+const START_STREAM: u64 = 3;
+
+/// Lets the patient of a configuration start somewhere in what is stated of the start, and so with a blood volume that
+/// nobody knows.
+///
+/// # Errors
+/// When the initial pressures have no solution.
+pub fn draw_start(config: &mut Config, seed: u64) -> Result<(), ConfigError> {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(START_STREAM);
+    let mut drawn = config.patient.initial_pressures()?.into_iter().zip(config.patient.initial_sd()).map(|(p, sd)| {
+        let e: f64 = StandardNormal.sample(&mut rng);
+        p + sd * e
+    });
+    config.patient.initial.iter_mut().for_each(|pressure| *pressure = drawn.next());
+    Ok(())
+}
+
 /// A patient in motion, wandering parameters and noisy sensors included. Deterministic in configuration and seed, and
 /// in how often it is asked: sensors draw noise for every state at every call, so that one record does not depend on
 /// which channels are looked at.

@@ -2,11 +2,11 @@
 
 use super::circulation::{Case, CaseRun, Scenario, quantities};
 use super::correlation::strength;
-use super::plot::{Chart, Colour, Figure};
-use super::report::{Report, Table, mean, rms, short};
 use super::{Context, StudyError};
 use crate::estimate::statistics::{Summary, mean_and_sd};
 use crate::model::Model;
+use crate::report::plot::{Chart, Colour, Figure};
+use crate::report::{Report, Table, mean, rms, short};
 
 /// Published total coefficients of variation in scenarios 1 to 5 \[%\], "below" where the paper gives a bound.
 const PUBLISHED: &[(&str, &str)] = &[

@@ -1,10 +1,10 @@
 //! `correlation`: how the errors of the six pressures hang together.
 
 use super::circulation::{Case, CaseRun, Scenario, quantities};
-use super::plot::{Figure, HeatMap};
-use super::report::{Report, Table};
 use super::{Context, StudyError};
 use crate::estimate::statistics::correlation;
+use crate::report::plot::{Figure, HeatMap};
+use crate::report::{Report, Table};
 
 const MOMENTS: [&str; 3] = ["start", "diastole", "systole"];
 
@@ -66,5 +66,5 @@ pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
 pub(super) fn strength(members: &[f64], run: &CaseRun) -> f64 {
     let count = run.config.estimator.members;
     let matrix = correlation(&members[..6 * count], count);
-    super::report::mean((0..36).filter(|e| e / 6 != e % 6).map(|e| matrix[e].abs()))
+    crate::report::mean((0..36).filter(|e| e / 6 != e % 6).map(|e| matrix[e].abs()))
 }

@@ -1,10 +1,10 @@
 //! `decomposition`: uncertainty by source over a beat.
 
 use super::circulation::{Case, CaseRun, Scenario, quantities};
-use super::plot::{Chart, Colour, Figure};
-use super::report::{Report, Table, mean, short};
 use super::{Context, StudyError};
 use crate::estimate::statistics::Summary;
+use crate::report::plot::{Chart, Colour, Figure};
+use crate::report::{Report, Table, mean, short};
 
 /// What is shown, in the order of the model.
 const SHOWN: [&str; 4] = ["p_l", "p_a", "q_li", "q_lo"];

@@ -5,8 +5,6 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal, Uniform};
 
 use super::experiment::{Experiment, Sample, Trace};
-use super::plot::{Chart, Colour, Figure};
-use super::report::{Report, Table, mean, plus_minus, rms, short};
 use super::{Context, StudyError, timed};
 use crate::estimate::settings::{
     Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, LiveSettings, RowWeights,
@@ -16,6 +14,8 @@ use crate::estimate::statistics::{Summary, mean_and_sd};
 use crate::estimate::time::ns_from_s;
 use crate::model::Model;
 use crate::model::harmonic::{Harmonic, Parameter};
+use crate::report::plot::{Chart, Colour, Figure};
+use crate::report::{Report, Table, mean, plus_minus, rms, short};
 use crate::xtfc::features::{Activation, FeatureSpec, Nodes, WeightDistribution};
 use crate::xtfc::problem::Stopping;
 

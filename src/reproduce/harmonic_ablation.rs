@@ -1,10 +1,10 @@
 //! `harmonic-ablation`: members, neurons, activations and initial distributions, one at a time.
 
 use super::harmonic::{DATA_UNTIL_S, HORIZON_S, K, Setup, X0, error_and_band, k_of, shared_record};
-use super::plot::{Chart, Colour, Figure};
-use super::report::{Report, Table, plus_minus, short};
 use super::{Context, StudyError};
 use crate::model::harmonic::Harmonic;
+use crate::report::plot::{Chart, Colour, Figure};
+use crate::report::{Report, Table, plus_minus, short};
 use crate::xtfc::features::{Activation, WeightDistribution};
 
 /// What is changed, as it is written in the table and in the summary.

@@ -2,13 +2,13 @@
 
 use super::experiment::{Experiment, Sample, Trace};
 use super::harmonic::{HORIZON_S, K, Setup, X0, curve, grid, record, with_data};
-use super::plot::{Figure, Panel};
-use super::report::{Report, Table, mean, rms, short};
 use super::{Context, StudyError};
 use crate::estimate::settings::{CouplingKind, EstimatorSettings};
 use crate::estimate::statistics::Summary;
 use crate::model::discrepancy::{Discrepancy, Discrepant, Form};
 use crate::model::harmonic::{Harmonic, Law, Parameter};
+use crate::report::plot::{Figure, Panel};
+use crate::report::{Report, Table, mean, rms, short};
 
 /// Sd of the sensor; x goes up to 27.
 const NOISE_SD: f64 = 0.2;

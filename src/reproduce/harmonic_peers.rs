@@ -13,12 +13,12 @@ pub(super) fn run(_: &super::Context<'_>) -> Result<super::Report, super::StudyE
 mod study {
     use crate::estimate::statistics::mean_and_sd;
     use crate::model::harmonic::Harmonic;
+    use crate::report::plot::{Chart, Colour, Figure};
+    use crate::report::{Report, Table, mean, plus_minus, rms, short};
     use crate::reproduce::harmonic::{
         DATA_UNTIL_S, HORIZON_S, K, K_GUESS, NOISE_SD, Setup, X0, error_and_band, grid, k_of, shared_record,
     };
     use crate::reproduce::peers::{BayesianSettings, PinnSettings, Task, bayesian, pinn};
-    use crate::reproduce::plot::{Chart, Colour, Figure};
-    use crate::reproduce::report::{Report, Table, mean, plus_minus, rms, short};
     use crate::reproduce::{Context, StudyError, timed};
 
     /// A method, its `k`, what it predicts, how long it took.

@@ -1,11 +1,11 @@
 //! `harmonic-weights`: the weight of the physics swept over decades.
 
 use super::harmonic::{DATA_UNTIL_S, HORIZON_S, K, Setup, X0, chart, error_and_band, k_of, shared_record};
-use super::plot::{Chart, Colour, Figure};
-use super::report::{Report, Table, plus_minus, short};
 use super::{Context, StudyError};
 use crate::estimate::settings::CouplingKind;
 use crate::model::harmonic::Harmonic;
+use crate::report::plot::{Chart, Colour, Figure};
+use crate::report::{Report, Table, plus_minus, short};
 
 pub(super) fn run(context: &Context<'_>) -> Result<Report, StudyError> {
     let mut report = Report::new("harmonic-weights", "Weight of the physics");

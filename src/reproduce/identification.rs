@@ -5,8 +5,6 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 use super::experiment::{Experiment, Sample, Trace};
-use super::plot::{Chart, Colour, Figure};
-use super::report::{Report, Table, mean, rms, short};
 use super::{Context, StudyError};
 use crate::estimate::settings::{
     Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, LiveSettings, RowWeights,
@@ -18,6 +16,8 @@ use crate::model::discrepancy::{Discrepancy, Discrepant, Form};
 use crate::model::lorenz::{self, Lorenz};
 use crate::model::oscillator::{self, Oscillator};
 use crate::model::truth::Simulator;
+use crate::report::plot::{Chart, Colour, Figure};
+use crate::report::{Report, Table, mean, rms, short};
 use crate::xtfc::features::{FeatureSpec, Nodes};
 use crate::xtfc::problem::Stopping;
 

@@ -3,7 +3,8 @@
 //!
 //! Invariants: the paper's settings are the defaults, what the paper leaves open is written into the report; a study
 //! is a function of its settings and its seed, wall time apart.
-//! Deliberately absent: anything that the daemon needs. Layers: this one stands on all others and nothing on it.
+//! Deliberately absent: anything that the daemon needs. Layers: this one and [`validate`](crate::validate) stand on
+//! all others and nothing on them.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -14,6 +15,7 @@ use crate::estimate::settings::SettingsError;
 use crate::estimate::time::s_from_ns;
 use crate::model::discrepancy::DiscrepancyError;
 use crate::model::truth::SimulationError;
+use crate::report::Report;
 use crate::runtime::clock::Clock;
 use crate::runtime::workers::Workers;
 
@@ -30,13 +32,10 @@ mod harmonic_weights;
 mod identification;
 #[cfg(feature = "peers")]
 pub mod peers;
-pub mod plot;
-pub mod report;
 mod resistance;
 
 pub use circulation::paper_config;
 use circulation::{Case, CaseRun};
-pub use report::{Report, ReportError};
 
 /// A study that can be asked for by name.
 pub struct Study {

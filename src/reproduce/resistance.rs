@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 
 use super::circulation::{Record, paper_config, quantities, record};
 use super::experiment::{Experiment, Trace};
-use super::plot::{Chart, Colour, Figure};
-use super::report::{Report, Table, mean, rms, short};
 use super::{Context, StudyError};
 use crate::edge::config::{Config, Coupling, DiscrepancyForm, DiscrepancySettings, InitialSd, PulmonaryLaw};
 use crate::model::cvsim6::{Derived, Pressures, State};
+use crate::report::plot::{Chart, Colour, Figure};
+use crate::report::{Report, Table, mean, rms, short};
 
 /// Position of the pulmonary flow among the true quantities.
 const Q_PV: usize = Pressures::LEN + Derived::QPv as usize;

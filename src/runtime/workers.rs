@@ -1,6 +1,9 @@
 //! A fixed pool of threads for the solves.
 
-use rayon::iter::{IndexedParallelIterator, IntoParallelIterator, IntoParallelRefMutIterator, ParallelIterator};
+use rayon::iter::{
+    IndexedParallelIterator, IntoParallelIterator, IntoParallelRefIterator, IntoParallelRefMutIterator,
+    ParallelIterator,
+};
 
 use crate::estimate::ensemble::{Member, Parallel};
 
@@ -43,6 +46,11 @@ impl Workers {
     /// Runs `job` so that what it does in parallel uses this pool.
     pub fn install<T: Send>(&self, job: impl FnOnce() -> T + Send) -> T {
         self.pool.install(job)
+    }
+
+    /// Does `job` for every item, side by side; results in the order of the items.
+    pub fn map<T: Sync, R: Send>(&self, items: &[T], job: impl Fn(&T) -> R + Send + Sync) -> Vec<R> {
+        self.pool.install(|| items.par_iter().with_max_len(1).map(job).collect())
     }
 
     /// Runs `job` on some thread of the pool, some time.

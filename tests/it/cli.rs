@@ -162,6 +162,13 @@ fn bad_usage_and_bad_settings_exit_with_2() {
         (vec!["simulate", "--seconds=-1", "--truth", "x.csv"], "above 0"),
         (vec!["simulate"], "--truth"),
         (vec!["watch"], "terminal"),
+        (vec!["validate", "--patient", "helthy"], "expected a TOML file or one of healthy, pulmonary"),
+        (vec!["validate", "--patient", "no_such.toml"], "no_such.toml"),
+        (vec!["validate", "--scenario", "stepp"], "arterial_line_only"),
+        (vec!["validate", "--seconds", "1"], "expected a number from 4 to 600"),
+        (vec!["validate", "--observed", "p_x"], "p_x"),
+        (vec!["validate", "--set", "patient.r_pv=1"], "--patient"),
+        (vec!["validate", "--set", "estimator.coupling=ukf"], "--rival"),
         (vec!["frobnicate"], "frobnicate"),
     ] {
         let output = hemostream(&arguments);
@@ -173,7 +180,7 @@ fn bad_usage_and_bad_settings_exit_with_2() {
 
 #[test]
 fn every_command_has_help_with_an_example() {
-    for command in ["demo", "serve", "replay", "watch", "simulate", "estimate", "config"] {
+    for command in ["demo", "serve", "replay", "watch", "simulate", "estimate", "validate", "config"] {
         let output = hemostream(&[command, "--help"]);
         assert!(output.status.success());
         assert!(text(&output.stdout).contains(&format!("hemostream {command}")), "{command}");

@@ -51,7 +51,7 @@ fn fixtures(kind: &str) -> Vec<PathBuf> {
 }
 
 fn presets() -> Vec<PathBuf> {
-    ["config/default.toml", "config/paper.toml", "config/patients/pulmonary_hypertension.toml"]
+    ["config/default.toml", "config/paper.toml", "config/validate.toml", "config/patients/pulmonary_hypertension.toml"]
         .map(in_repository)
         .into()
 }
@@ -173,6 +173,20 @@ fn origins_list_every_setting_once_in_the_order_of_the_schema() {
     unique.dedup();
     assert_eq!(unique.len(), keys.len());
     assert!(keys.iter().all(|&key| known_keys().iter().any(|known| known == key)));
+}
+
+#[test]
+fn a_preset_lies_between_the_defaults_and_the_file() {
+    let preset = ("preset.toml", "[window]\nlength_s = 0.004\nneurons = 7\nweights = { normal = [0.0, 1.0] }\n");
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file.toml");
+    std::fs::write(&file, "[window]\nneurons = 9\nweights = { exponential = 1.0 }\n").unwrap();
+    let (config, origins) = Config::load_over(preset, Some(&file), &[]).unwrap();
+    assert_eq!((config.window.length_s, config.window.neurons), (0.004, 9));
+    assert_eq!(config.window.weights, Distribution::Exponential(1.0));
+    assert_eq!(origins.get("window.length_s").unwrap().origin, "preset.toml");
+    let wrong = Config::load_text("preset.toml", "[window]\nlenght_s = 0.004\n").unwrap_err().to_string();
+    assert!(wrong.contains("preset.toml:2"), "{wrong}");
 }
 
 #[test]

@@ -14,5 +14,6 @@ mod stream;
 mod support;
 mod tidy;
 mod twin;
+mod validate;
 mod window;
 mod xtfc;

@@ -3,7 +3,8 @@
 use std::path::Path;
 
 use hemostream::edge::config::Config;
-use hemostream::reproduce::{Context, Report, STUDIES, paper_config, report};
+use hemostream::report::{self, Report};
+use hemostream::reproduce::{Context, STUDIES, paper_config};
 use hemostream::runtime::workers::Workers;
 
 fn quick(names: &[&str]) -> Vec<Report> {

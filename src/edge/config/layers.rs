@@ -24,6 +24,11 @@ pub(super) const PREFIX: &str = "HEMOSTREAM_";
 /// Variables with our prefix that are not settings: the filter of the log.
 const OTHER_VARIABLES: &[&str] = &["HEMOSTREAM_LOG"];
 
+/// Ranks of the layers over the defaults; every `--set` has one of its own above them.
+const PRESET_RANK: usize = 1;
+const FILE_RANK: usize = 2;
+const ENVIRONMENT_RANK: usize = 3;
+
 /// Largest file that is read \[bytes\].
 const MAX_FILE_BYTES: u64 = 1 << 20;
 
@@ -82,8 +87,9 @@ pub(super) struct Stack {
 }
 
 impl Stack {
-    /// Reads and merges the sources.
+    /// Reads and merges the sources; a preset (name and text) lies under the file.
     pub(super) fn read(
+        preset: Option<(&str, &str)>,
         file: Option<&Path>,
         environment: impl IntoIterator<Item = (String, String)>,
         sets: &[String],
@@ -91,6 +97,11 @@ impl Stack {
         let defaults = to_value(&Config::default()).into_dict().unwrap_or_default();
         let mut layers = vec![Layer { origin: "default".to_owned(), rank: 0, values: defaults }];
         let mut places = Places(None);
+        if let Some((name, text)) = preset {
+            let (layer, lines) = text_layer(name.to_owned(), text)?;
+            places = Places(Some((layer.origin.clone(), lines)));
+            layers.push(layer);
+        }
         if let Some(path) = file {
             let (layer, lines) = file_layer(path)?;
             places = Places(Some((layer.origin.clone(), lines)));
@@ -98,7 +109,7 @@ impl Stack {
         }
         layers.extend(environment_layers(environment));
         for (position, argument) in sets.iter().enumerate() {
-            layers.push(set_layer(argument, 3 + position)?);
+            layers.push(set_layer(argument, ENVIRONMENT_RANK + 1 + position)?);
         }
 
         let shapes = Value::from(layers[0].values.clone());
@@ -163,14 +174,20 @@ fn file_layer(path: &Path) -> Result<(Layer, Lines), ConfigError> {
     if bytes as u64 > MAX_FILE_BYTES {
         return Err(unreadable(format!("found more than {MAX_FILE_BYTES} bytes, expected a configuration")));
     }
-    let table = toml::from_str::<toml::Table>(&text).map_err(|error| {
-        let (line, column) = lines::position(&text, error.span().map_or(0, |span| span.start));
+    let (layer, lines) = text_layer(file, &text)?;
+    Ok((Layer { rank: FILE_RANK, ..layer }, lines))
+}
+
+/// A file that has been read, under what it is called.
+fn text_layer(file: String, text: &str) -> Result<(Layer, Lines), ConfigError> {
+    let table = toml::from_str::<toml::Table>(text).map_err(|error| {
+        let (line, column) = lines::position(text, error.span().map_or(0, |span| span.start));
         ConfigError::Syntax { file: file.clone(), line, column, reason: error.message().replace('\n', ", ") }
     })?;
     let values = table.into_iter().map(|(name, value)| (name, from_toml(value))).collect();
-    let mut lines = Lines::of(&text);
+    let mut lines = Lines::of(text);
     lines.alias(INITIAL_SD_ALIAS, INITIAL_SD);
-    Ok((Layer { origin: file, rank: 1, values }, lines))
+    Ok((Layer { origin: file, rank: PRESET_RANK, values }, lines))
 }
 
 fn environment_layers(variables: impl IntoIterator<Item = (String, String)>) -> Vec<Layer> {
@@ -184,7 +201,7 @@ fn environment_layers(variables: impl IntoIterator<Item = (String, String)>) -> 
         let is_label = |position: usize| position > 0 && segments[0].eq_ignore_ascii_case("labels");
         let spell = |(position, s): (usize, &String)| if is_label(position) { s.clone() } else { s.to_lowercase() };
         let path: Vec<String> = segments.iter().enumerate().map(spell).collect();
-        Layer { origin: format!("environment {name}"), rank: 2, values: nest(&path, parse_value(&text)) }
+        Layer { origin: format!("environment {name}"), rank: ENVIRONMENT_RANK, values: nest(&path, parse_value(&text)) }
     };
     variables.into_iter().map(layer).collect()
 }

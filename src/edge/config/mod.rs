@@ -41,10 +41,27 @@ impl Config {
     /// # Errors
     /// When a source cannot be read, or a setting is unknown, of the wrong type or out of range.
     pub fn load(file: Option<&Path>, sets: &[String]) -> Result<(Self, Origins), ConfigError> {
-        // What is not Unicode cannot be one of our names; in a value it shows up as a replacement character.
-        let text = |os: std::ffi::OsString| os.to_string_lossy().into_owned();
-        let environment = std::env::vars_os().map(|(name, value)| (text(name), text(value)));
-        Self::load_from(file, environment, sets)
+        Self::load_layers(None, file, environment(), sets)
+    }
+
+    /// As [`Config::load`], with a preset (its name and text) between the defaults and the file.
+    ///
+    /// # Errors
+    /// As [`Config::load`].
+    pub fn load_over(
+        preset: (&str, &str),
+        file: Option<&Path>,
+        sets: &[String],
+    ) -> Result<(Self, Origins), ConfigError> {
+        Self::load_layers(Some(preset), file, environment(), sets)
+    }
+
+    /// The text of a file alone over the defaults, under what it is called.
+    ///
+    /// # Errors
+    /// As [`Config::load`].
+    pub fn load_text(name: &str, text: &str) -> Result<Self, ConfigError> {
+        Ok(Self::load_layers(Some((name, text)), None, [], &[])?.0)
     }
 
     /// As [`Config::load`], with the environment as an argument.
@@ -56,7 +73,16 @@ impl Config {
         environment: impl IntoIterator<Item = (String, String)>,
         sets: &[String],
     ) -> Result<(Self, Origins), ConfigError> {
-        let stack = layers::Stack::read(file, environment, sets)?;
+        Self::load_layers(None, file, environment, sets)
+    }
+
+    fn load_layers(
+        preset: Option<(&str, &str)>,
+        file: Option<&Path>,
+        environment: impl IntoIterator<Item = (String, String)>,
+        sets: &[String],
+    ) -> Result<(Self, Origins), ConfigError> {
+        let stack = layers::Stack::read(preset, file, environment, sets)?;
         let config = stack.extract()?;
         let problems: Vec<Problem> = check::faults(&config).into_iter().map(|fault| fault.located(&stack)).collect();
         if !problems.is_empty() {
@@ -74,4 +100,10 @@ impl Config {
         let problems: Vec<Problem> = check::faults(self).into_iter().map(check::Fault::unlocated).collect();
         if problems.is_empty() { Ok(()) } else { Err(ConfigError::Settings(problems)) }
     }
+}
+
+/// What is not Unicode cannot be one of our names; in a value it shows up as a replacement character.
+fn environment() -> impl Iterator<Item = (String, String)> {
+    let text = |os: std::ffi::OsString| os.to_string_lossy().into_owned();
+    std::env::vars_os().map(move |(name, value)| (text(name), text(value)))
 }

@@ -63,6 +63,11 @@ impl<T> PerState<T> {
         Pressures::NAMES.iter().copied().zip(values)
     }
 
+    /// Values in the order of the states.
+    pub fn iter_mut(&mut self) -> impl Iterator<Item = &mut T> {
+        [&mut self.p_l, &mut self.p_a, &mut self.p_v, &mut self.p_r, &mut self.p_pa, &mut self.p_pv].into_iter()
+    }
+
     /// The value of the state called `name`.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&T> {

@@ -49,7 +49,15 @@ pub(super) fn draw(canvas: &mut Canvas, chart: &Chart, room: &Rect, gutter: f64)
 
 /// What stands left of the vertical axis.
 pub(super) fn y_names(chart: &Chart) -> Vec<String> {
-    axes(chart).1.ticks(Y_TICKS).into_iter().map(|tick| tick.label).collect()
+    y_ticks(chart, &axes(chart).1).into_iter().map(|tick| tick.label).collect()
+}
+
+fn y_ticks(chart: &Chart, axis: &Axis) -> Vec<Tick> {
+    if chart.y_names.is_empty() {
+        return axis.ticks(Y_TICKS);
+    }
+    let tick = |(k, name): (usize, &String)| Tick { at: axis.place(k as f64), label: name.clone() };
+    chart.y_names.iter().enumerate().map(tick).collect()
 }
 
 fn axes(chart: &Chart) -> (Axis, Axis) {
@@ -116,7 +124,7 @@ impl<'a> Plot<'a> {
             let x = snap(x0 + at * self.area.width());
             tick(&label, [(x, y0), (x, y1), (x, y1 + 3.0), (x, y1 + GAP + 0.6 * TICK.size)], "middle");
         }
-        for Tick { at, label } in self.y.ticks(Y_TICKS) {
+        for Tick { at, label } in y_ticks(self.chart, &self.y) {
             let y = snap(y1 - at * self.area.height());
             tick(&label, [(x1, y), (x0, y), (x0 - 3.0, y), (x0 - GAP, y)], "end");
         }

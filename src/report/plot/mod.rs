@@ -65,6 +65,8 @@ pub struct Chart {
     pub x_range: Option<(f64, f64)>,
     /// Lowest and highest y shown; from the items if absent or unusable.
     pub y_range: Option<(f64, f64)>,
+    /// What stands at 0, 1, 2 and so on of the vertical axis, instead of numbers; from the bottom up.
+    pub y_names: Vec<String>,
     /// Drawn by kind: regions, bands, lines, error bars, points; within a kind in this order.
     pub items: Vec<Item>,
 }
@@ -217,6 +219,14 @@ impl Chart {
     #[must_use]
     pub fn y_range(mut self, low: f64, high: f64) -> Self {
         self.y_range = Some((low, high));
+        self
+    }
+
+    /// Names the places 0, 1, 2 and so on of the vertical axis, from the bottom up, and shows just those.
+    #[must_use]
+    pub fn y_names(mut self, names: Vec<String>) -> Self {
+        self.y_range = Some((-0.7, names.len() as f64 - 0.3));
+        self.y_names = names;
         self
     }
 

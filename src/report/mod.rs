@@ -1,26 +1,31 @@
 //! What a study says: numbers for `summary.json`, tables, series for CSV, pictures, and prose; and the page of them.
+//!
+//! Invariants: the same report gives the same bytes.
+//! Deliberately absent: what is studied. Whoever studies something fills in a [`Report`].
+
+pub mod plot;
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value};
 
-use super::plot::{Figure, PlotError};
 use crate::edge::files::csv::{CsvError, TableWriter};
+use plot::{Figure, PlotError};
 
 /// A table of text.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Table {
+pub(crate) struct Table {
     header: Vec<String>,
     rows: Vec<Vec<String>>,
 }
 
 impl Table {
-    pub(super) fn new<T: Into<String>>(header: impl IntoIterator<Item = T>) -> Self {
+    pub(crate) fn new<T: Into<String>>(header: impl IntoIterator<Item = T>) -> Self {
         Self { header: header.into_iter().map(Into::into).collect(), rows: Vec::new() }
     }
 
-    pub(super) fn row<T: Into<String>>(&mut self, cells: impl IntoIterator<Item = T>) {
+    pub(crate) fn row<T: Into<String>>(&mut self, cells: impl IntoIterator<Item = T>) {
         self.rows.push(cells.into_iter().map(Into::into).collect());
     }
 
@@ -55,13 +60,13 @@ pub struct Report {
 }
 
 impl Report {
-    pub(super) fn new(name: &'static str, title: &str) -> Self {
+    pub(crate) fn new(name: &'static str, title: &str) -> Self {
         let title = title.to_owned();
         Self { name, title, figures: Map::new(), blocks: Vec::new(), pictures: Vec::new(), series: Vec::new() }
     }
 
     /// A number of the summary, by its dotted path within the study. Not finite becomes null.
-    pub(super) fn figure(&mut self, path: &str, value: f64) {
+    pub(crate) fn figure(&mut self, path: &str, value: f64) {
         let mut table = &mut self.figures;
         let mut keys = path.split('.').peekable();
         while let Some(key) = keys.next() {
@@ -85,22 +90,22 @@ impl Report {
         keys.try_fold(first, |value, key| value.get(key))?.as_f64()
     }
 
-    pub(super) fn text(&mut self, text: impl Into<String>) {
+    pub(crate) fn text(&mut self, text: impl Into<String>) {
         self.blocks.push(Block::Text(text.into()));
     }
 
-    pub(super) fn table(&mut self, table: Table) {
+    pub(crate) fn table(&mut self, table: Table) {
         self.blocks.push(Block::Table(table));
     }
 
     /// A picture; the caption says what is to be seen.
-    pub(super) fn picture(&mut self, stem: &str, figure: Figure, caption: impl Into<String>) {
+    pub(crate) fn picture(&mut self, stem: &str, figure: Figure, caption: impl Into<String>) {
         self.blocks.push(Block::Picture { stem: stem.to_owned(), caption: caption.into() });
         self.pictures.push((stem.to_owned(), figure));
     }
 
     /// The numbers behind a picture.
-    pub(super) fn series<T: Into<String>>(
+    pub(crate) fn series<T: Into<String>>(
         &mut self,
         stem: &str,
         header: impl IntoIterator<Item = T>,
@@ -190,17 +195,19 @@ fn html(markdown: &str) -> String {
     let options = pulldown_cmark::Options::ENABLE_TABLES;
     let mut body = String::new();
     pulldown_cmark::html::push_html(&mut body, pulldown_cmark::Parser::new_ext(markdown, options));
-    format!("{HEAD}{body}</body></html>\n")
+    let title = markdown.lines().find_map(|line| line.strip_prefix("# ")).unwrap_or("report");
+    format!(
+        "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><title>hemostream: {title}</title>{HEAD}{body}</body></html>\n"
+    )
 }
 
-const HEAD: &str = "<!doctype html><html lang=\"en\"><head><meta charset=\"utf-8\"><title>hemostream: the paper, reproduced\
-</title><style>body{font:16px/1.5 system-ui,sans-serif;max-width:80rem;margin:2rem auto;padding:0 1rem;color:#1a1a1a;\
+const HEAD: &str = "<style>body{font:16px/1.5 system-ui,sans-serif;max-width:80rem;margin:2rem auto;padding:0 1rem;color:#1a1a1a;\
 background:#fff}table{border-collapse:collapse;margin:1rem 0;font-variant-numeric:tabular-nums}th,td{border:1px solid \
 #d0d0d0;padding:.25rem .6rem;text-align:left}th{background:#f3f3f3}img{max-width:100%;height:auto}code{background:#f3f3f3;\
 padding:0 .2em}h2{margin-top:3rem;border-bottom:1px solid #d0d0d0}</style></head><body>";
 
 /// A number with a sensible count of digits.
-pub(super) fn short(value: f64) -> String {
+pub(crate) fn short(value: f64) -> String {
     if !value.is_finite() {
         return "-".to_owned();
     }
@@ -217,18 +224,18 @@ pub(super) fn short(value: f64) -> String {
 }
 
 /// `mean +- sd`.
-pub(super) fn plus_minus(mean: f64, sd: f64) -> String {
+pub(crate) fn plus_minus(mean: f64, sd: f64) -> String {
     format!("{mean:.4} ± {sd:.4}")
 }
 
 /// Mean of what there is; NaN of nothing.
 #[allow(clippy::cast_precision_loss)]
-pub(super) fn mean(values: impl Iterator<Item = f64>) -> f64 {
+pub(crate) fn mean(values: impl Iterator<Item = f64>) -> f64 {
     let (sum, n) = values.fold((0.0, 0_usize), |(sum, n), v| (sum + v, n + 1));
     sum / n as f64
 }
 
 /// Root mean square; NaN of nothing.
-pub(super) fn rms(values: impl Iterator<Item = f64>) -> f64 {
+pub(crate) fn rms(values: impl Iterator<Item = f64>) -> f64 {
     mean(values.map(|v| v * v)).sqrt()
 }
