@@ -1,4 +1,4 @@
-"""Wire schema v1 of hemostream: what crosses the bus, read with `struct` and numpy alone.
+"""Wire schema v2 of hemostream: what crosses the bus, read with `struct` and numpy alone.
 
 The bytes are bincode 2 with fixed-size little-endian integers and no framing: integers and floats are their
 bytes, a list or string is a `u64` length and its elements, fields follow each other in the order declared here.
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol, Self, TypeVar
 
@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Content = dict[str, Any]
 
-SCHEMA = 1
+SCHEMA = 2
 """Version of everything in this module."""
 
 MAX_PAYLOAD_BYTES = 1 << 20
@@ -40,8 +40,14 @@ FLAG_LAST_BLOCK = 1
 STATE_STATISTICS = ("mean", "sd", "epistemic_sd", "aleatoric_sd", "model_sd", "q05", "q95")
 """Last axis of `StateEstimate.values`."""
 
-PARAMETER_STATISTICS = ("mean", "sd", "q05", "q95", "identifiability", "since_informed_s")
+PARAMETER_STATISTICS = ("mean", "sd", "q05", "q95", "identifiability", "since_informed_s", "identifiable")
 """Last axis of `ParameterEstimate.values`."""
+
+BEAT_STATISTICS = ("mean", "sd", "q05", "q95")
+"""Last axis of `BeatEstimate.values`."""
+
+SMOOTHED_KEY = "estimate/smoothed"
+"""Where a `StateEstimate` comes again, corrected by what came in the smoothing lag."""
 
 
 class WireError(ValueError):
@@ -76,6 +82,12 @@ class Cursor:
 
     def _number(self, layout: str, what: str) -> Any:
         return struct.unpack_from(layout, self._payload, self._advance(struct.calcsize(layout), what))[0]
+
+    def boolean(self) -> bool:
+        value = int(self._number("<B", "bool"))
+        if value > 1:
+            raise Malformed(f"bool at byte {self._position - 1} is {value}, expected 0 or 1")
+        return value == 1
 
     def u16(self) -> int:
         return int(self._number("<H", "u16"))
@@ -147,6 +159,7 @@ class Message(Protocol):
 
 
 M = TypeVar("M", bound=Message)
+T = TypeVar("T")
 
 
 def decode(kind: type[M], payload: bytes) -> M:
@@ -255,6 +268,32 @@ class PressureBlock:
         return dict(vars(self))
 
 
+@dataclass(frozen=True, eq=False)
+class Beats:
+    """Onsets of heart beats, told by somebody who knows (key `beat`, towards the estimator)."""
+
+    onsets_ns: Integers
+    """Event times at which the ventricles began to contract [ns], `[beats]`."""
+    schema: int = SCHEMA
+
+    def encode(self) -> bytes:
+        """The bincode bytes."""
+        payload = struct.pack("<H", self.schema) + _encode_array(self.onsets_ns, "<i8")
+        _check_length(payload)
+        return payload
+
+    @classmethod
+    def read(cls, cursor: Cursor) -> Self:
+        return cls(schema=cursor.u16(), onsets_ns=cursor.integers())
+
+    @classmethod
+    def read_json(cls, body: Mapping[str, Any]) -> Self:
+        return cls(schema=_integer(body, "schema"), onsets_ns=_integers(body, "onsets_ns"))
+
+    def content(self) -> Content:
+        return dict(vars(self))
+
+
 @dataclass(frozen=True)
 class Header:
     """What every published message starts with."""
@@ -289,7 +328,10 @@ class Header:
 
 @dataclass(frozen=True, eq=False)
 class StateEstimate:
-    """Pressures, flows and volumes with their uncertainty, at one or more times (key `estimate/state`)."""
+    """Pressures, flows and volumes with their uncertainty, at one or more times (key `estimate/state`).
+
+    Under the key `estimate/smoothed` the estimated parameters follow the quantities.
+    """
 
     KEY: ClassVar[str] = "estimate/state"
 
@@ -301,7 +343,7 @@ class StateEstimate:
     since_data_s: Floats
     """Seconds since data last entered the estimate, `[times]`; a forecast where it exceeds a sampling interval."""
     names: tuple[str, ...]
-    """Names of the quantities."""
+    """Names of the quantities; under `estimate/smoothed` also of the parameters."""
     values: Floats
     """`[times x names x 7]`, the `STATE_STATISTICS` of each in its own unit; q05 and q95 describe the true quantity."""
 
@@ -352,11 +394,21 @@ class ParameterEstimate:
     names: tuple[str, ...]
     """Names of the parameters."""
     values: Floats
-    """`[names x 6]`, the `PARAMETER_STATISTICS` of each.
+    """`[names x 7]`, the `PARAMETER_STATISTICS` of each.
 
     mean, sd, q05 and q95 in the parameter's unit (heart_rate bpm, c_* mL/mmHg, r_* mmHg s/mL, p_th mmHg,
-    v0_* and blood_volume mL); identifiability without unit; since_informed_s in s.
+    v0_* and blood_volume mL); identifiability without unit; since_informed_s in s; identifiable is 1 where data
+    rather than settings say what the value is, else 0 (true or false in JSON).
     """
+
+    def __post_init__(self) -> None:
+        flags = self.values[:, PARAMETER_STATISTICS.index("identifiable")]
+        if not np.isin(flags, (0.0, 1.0)).all():
+            raise Malformed(f"`identifiable` holds {flags.tolist()!r:.60}, expected 0 or 1")
+
+    def is_identifiable(self, name: str) -> bool:
+        """Whether data rather than settings say what the value of a parameter is."""
+        return self.value(name, "identifiable") == 1.0
 
     def value(self, name: str, statistic: str) -> float:
         """One statistic of one parameter."""
@@ -372,7 +424,7 @@ class ParameterEstimate:
     def read_json(cls, body: Mapping[str, Any]) -> Self:
         parameters = _object(body, "parameters")
         names = _named(body, parameters)
-        rows = [[_required(_object(parameters, n), s) for s in PARAMETER_STATISTICS] for n in names]
+        rows = [_parameter_row(_object(parameters, n)) for n in names]
         values = _floats([value for row in rows for value in row], "parameters")
         shape = (len(names), len(PARAMETER_STATISTICS))
         return cls(Header.read_json(body), _integer(body, "members"), names, _shaped(values, shape))
@@ -380,6 +432,59 @@ class ParameterEstimate:
     def content(self) -> Content:
         values = {f"parameters.{n}.{s}": self.value(n, s) for n in self.names for s in PARAMETER_STATISTICS}
         return self.header.content() | {"members": self.members} | values
+
+
+@dataclass(frozen=True, eq=False)
+class BeatEstimate:
+    """A heart beat that is over (key `estimate/beat`)."""
+
+    KEY: ClassVar[str] = "estimate/beat"
+
+    header: Header
+    """Its time is the onset."""
+    members: int
+    """Members that took part."""
+    end_ns: int
+    """Event time at which the next beat began [ns]."""
+    names: tuple[str, ...]
+    """Names of the clinical quantities."""
+    units: tuple[str, ...]
+    """Their units, `[names]`; empty for a ratio."""
+    values: Floats
+    """`[names x 4]`, the `BEAT_STATISTICS` of each in its own unit."""
+
+    def __post_init__(self) -> None:
+        if len(self.units) != len(self.names):
+            raise Malformed(f"{len(self.units)} units for {len(self.names)} names")
+
+    def value(self, name: str, statistic: str) -> float:
+        """One statistic of one quantity."""
+        return float(self.values[self.names.index(name), BEAT_STATISTICS.index(statistic)])
+
+    def unit(self, name: str) -> str:
+        """Unit of one quantity."""
+        return self.units[self.names.index(name)]
+
+    @classmethod
+    def read(cls, cursor: Cursor) -> Self:
+        header, members, end_ns = Header.read(cursor), cursor.u32(), cursor.i64()
+        names, units = _unique(cursor.strings()), cursor.strings()
+        return cls(header, members, end_ns, names, units, _shaped(cursor.floats(), (len(names), len(BEAT_STATISTICS))))
+
+    @classmethod
+    def read_json(cls, body: Mapping[str, Any]) -> Self:
+        header, members, end_ns = Header.read_json(body), _integer(body, "members"), _integer(body, "end_ns")
+        by_name = _object(body, "quantities")
+        names = _named(body, by_name)
+        quantities = [_object(by_name, name) for name in names]
+        units = tuple(_string(quantity, "unit") for quantity in quantities)
+        values = _floats([_required(quantity, s) for quantity in quantities for s in BEAT_STATISTICS], "quantities")
+        return cls(header, members, end_ns, names, units, _shaped(values, (len(names), len(BEAT_STATISTICS))))
+
+    def content(self) -> Content:
+        units = {f"quantities.{n}.unit": self.unit(n) for n in self.names}
+        values = {f"quantities.{n}.{s}": self.value(n, s) for n in self.names for s in BEAT_STATISTICS}
+        return self.header.content() | {"members": self.members, "end_ns": self.end_ns} | units | values
 
 
 @dataclass(frozen=True, eq=False)
@@ -427,10 +532,34 @@ class ChannelStatus:
     """Samples that entered the estimate."""
     innovation_rms: float
     """Root mean square of the normalised innovations, lately: 1 when model and noise fit."""
+    noise_sd: float
+    """Noise that the sensor is taken to have [mmHg]."""
+    whiteness: float
+    """Mean square of sums of neighbouring innovations: 1 when the model fits, more when it is off for a while."""
+    recurrence: float
+    """Mean square of innovations laid over each other beat by beat: 1 when the model fits."""
+    misfit: bool
+    """Whether the model no longer fits this channel."""
+    artefact: str
+    """Why the channel is set aside; empty if it is not."""
+
+    MIN_BYTES: ClassVar[int] = 8 + 8 + 8 + 8 + 4 * 8 + 1 + 8
+    """On the wire, with empty strings."""
 
     @classmethod
     def read(cls, cursor: Cursor) -> Self:
-        return cls(cursor.string(), cursor.string(), cursor.i64(), cursor.u64(), cursor.f64())
+        return cls(
+            name=cursor.string(),
+            state=cursor.string(),
+            last_sample_ns=cursor.i64(),
+            samples_used=cursor.u64(),
+            innovation_rms=cursor.f64(),
+            noise_sd=cursor.f64(),
+            whiteness=cursor.f64(),
+            recurrence=cursor.f64(),
+            misfit=cursor.boolean(),
+            artefact=cursor.string(),
+        )
 
     @classmethod
     def read_json(cls, body: Mapping[str, Any]) -> Self:
@@ -440,6 +569,11 @@ class ChannelStatus:
             last_sample_ns=_integer(body, "last_sample_ns"),
             samples_used=_integer(body, "samples_used"),
             innovation_rms=_float(body, "innovation_rms"),
+            noise_sd=_float(body, "noise_sd"),
+            whiteness=_float(body, "whiteness"),
+            recurrence=_float(body, "recurrence"),
+            misfit=_boolean(body, "misfit"),
+            artefact=_string(body, "artefact"),
         )
 
     def content(self) -> Content:
@@ -479,6 +613,8 @@ class Status:
     """What was refused or lost, by cause; causes with count 0 are left out."""
     channels: tuple[ChannelStatus, ...]
     """Channels that are observed or configured to be."""
+    disagreement: dict[str, float]
+    """How far a second filter is from the estimates, by name, in units of both sd together; empty without one."""
 
     @classmethod
     def read(cls, cursor: Cursor) -> Self:
@@ -495,13 +631,15 @@ class Status:
             iterations=cursor.f64(),
             not_converged=cursor.u64(),
             queue_depth=cursor.u32(),
-            counters=_read_counters(cursor),
-            channels=tuple(ChannelStatus.read(cursor) for _ in range(cursor.length(40))),
+            counters=_read_by_name(cursor, cursor.u64),
+            channels=tuple(ChannelStatus.read(cursor) for _ in range(cursor.length(ChannelStatus.MIN_BYTES))),
+            disagreement=_read_by_name(cursor, cursor.f64),
         )
 
     @classmethod
     def read_json(cls, body: Mapping[str, Any]) -> Self:
         counters, channels = _object(body, "counters"), _list(body, "channels")
+        disagreement = _object(body, "disagreement")
         if not all(isinstance(channel, dict) for channel in channels):
             raise Malformed("`channels` holds something that is not an object")
         return cls(
@@ -519,12 +657,15 @@ class Status:
             queue_depth=_integer(body, "queue_depth"),
             counters={cause: _integer(counters, cause) for cause in counters},
             channels=tuple(ChannelStatus.read_json(channel) for channel in channels),
+            disagreement={name: _float(disagreement, name) for name in disagreement},
         )
 
     def content(self) -> Content:
-        own = {name: value for name, value in vars(self).items() if name not in ("header", "channels")}
+        apart = ("header", "channels", "disagreement")
+        own = {name: value for name, value in vars(self).items() if name not in apart}
         channels = {f"channels[{i}].{k}": v for i, c in enumerate(self.channels) for k, v in c.content().items()}
-        return self.header.content() | own | channels
+        disagreement = {f"disagreement.{name}": value for name, value in self.disagreement.items()}
+        return self.header.content() | own | channels | disagreement
 
 
 @dataclass(frozen=True)
@@ -598,10 +739,15 @@ def _encode_array(values: Integers | Floats, layout: str) -> bytes:
     return struct.pack("<Q", len(values)) + np.asarray(values).astype(layout).tobytes()
 
 
-def _read_counters(cursor: Cursor) -> dict[str, int]:
-    pairs = [(cursor.string(), cursor.u64()) for _ in range(cursor.length(16))]
-    _unique(cause for cause, _ in pairs)
+def _read_by_name(cursor: Cursor, read: Callable[[], T]) -> dict[str, T]:
+    """Pairs of a name and a number of 8 bytes."""
+    pairs = [(cursor.string(), read()) for _ in range(cursor.length(16))]
+    _unique(name for name, _ in pairs)
     return dict(pairs)
+
+
+def _parameter_row(body: Mapping[str, Any]) -> list[Any]:
+    return [float(_boolean(body, s)) if s == "identifiable" else _required(body, s) for s in PARAMETER_STATISTICS]
 
 
 def _unique(names: Iterable[str]) -> tuple[str, ...]:
@@ -646,9 +792,6 @@ def _required(body: Mapping[str, Any], name: str) -> Any:
     return body[name]
 
 
-T = TypeVar("T")
-
-
 def _typed(body: Mapping[str, Any], name: str, kind: type[T], expected: str) -> T:
     value = _required(body, name)
     # bool is an int to Python, not to JSON.
@@ -661,6 +804,13 @@ def _integer(body: Mapping[str, Any], name: str) -> int:
     value = _typed(body, name, int, "an integer")
     if not -(1 << 63) <= value < 1 << 64:
         raise Malformed(f"`{name}` is an integer beyond 64 bits")
+    return value
+
+
+def _boolean(body: Mapping[str, Any], name: str) -> bool:
+    value = _required(body, name)
+    if not isinstance(value, bool):
+        raise Malformed(f"`{name}` is {value!r:.60}, expected true or false")
     return value
 
 

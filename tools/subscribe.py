@@ -1,4 +1,4 @@
-"""Follows hemostream estimates live: one line per bed and second, events as they come, rows to a CSV file."""
+"""Follows hemostream estimates live: one line per bed and second, beats and events as they come, rows to a CSV file."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from typing import Any, NamedTuple
 from hemostream_rows import ColumnsChanged, RowFile
 from hemostream_twins import TwinCheck
 from hemostream_wire import (
+    SMOOTHED_KEY,
+    BeatEstimate,
     Event,
     Header,
     ParameterEstimate,
@@ -38,8 +40,15 @@ except ImportError as missing:
 
 OK, FAILED, USAGE = 0, 1, 2
 
-Published = StateEstimate | ParameterEstimate | Status | Event
-KINDS: dict[str, type[Published]] = {kind.KEY: kind for kind in (StateEstimate, ParameterEstimate, Status, Event)}
+Published = StateEstimate | ParameterEstimate | BeatEstimate | Status | Event
+KINDS: dict[str, type[Published]] = {
+    StateEstimate.KEY: StateEstimate,
+    ParameterEstimate.KEY: ParameterEstimate,
+    SMOOTHED_KEY: StateEstimate,
+    BeatEstimate.KEY: BeatEstimate,
+    Status.KEY: Status,
+    Event.KEY: Event,
+}
 
 UNDECODABLE = "undecodable messages"
 NOT_WRITTEN = "messages of other beds not written to the file"
@@ -60,6 +69,16 @@ FORECAST_AFTER_S = 0.5
 
 BAND = ("mean", "q05", "q95")
 LIVE_PRESSURES = ("p_a", "p_pa", "p_l", "p_v")
+BEAT_FIGURES = (
+    ("heart_rate", "HR", ".1f"),
+    ("stroke_volume", "SV", ".1f"),
+    ("cardiac_output", "CO", ".2f"),
+    ("ejection_fraction", "EF", ".2f"),
+    ("svr", "SVR", "#.3g"),
+    ("pvr", "PVR", "#.3g"),
+)
+"""Clinical quantities in the line of a beat, as they are called there, and their digits."""
+BEAT_PRESSURES = ("p_a_systolic", "p_a_diastolic", "p_a_mean")
 EPOCH_FROM_NS = 10**18
 """Event times from here on (2001) are shown as dates; earlier ones count from the start of a record."""
 
@@ -172,7 +191,9 @@ class Bed:
         parts = ["no state yet"] if self.state is None else self._pressures(self.state)
         if self.parameters is not None:
             p = self.parameters
-            parts += [banded(n, [p.value(n, s) for s in BAND], "#.4g") for n in p.names]
+            for n in p.names:
+                mark = "" if p.is_identifiable(n) else " (not identifiable)"
+                parts.append(banded(n, [p.value(n, s) for s in BAND], "#.4g") + mark)
         return parts
 
     @staticmethod
@@ -217,7 +238,7 @@ class Follower:
             self._compare(self.twins, received.key, bed, topic, is_json, message)
             if is_json:
                 return
-        self._take(bed, message, now_s)
+        self._take(bed, topic, message, now_s)
 
     def print_lines(self, now_s: float) -> None:
         for name in sorted(self.beds):
@@ -263,10 +284,15 @@ class Follower:
             where = f"{key}, sequence {message.header.sequence}"
             warn(f"{where}: bincode and JSON differ in {'; '.join(found[:3])}")
 
-    def _take(self, bed: str, message: Published, now_s: float) -> None:
+    def _take(self, bed: str, topic: str, message: Published, now_s: float) -> None:
+        if topic == SMOOTHED_KEY:
+            # Of the same times once more, and later: not for the live line, nor for the rows.
+            return
         self.beds[bed].take(message, now_s)
         if isinstance(message, Event):
             print(event_line(bed, message), flush=True)
+        elif isinstance(message, BeatEstimate):
+            print(beat_line(bed, message), flush=True)
         if self._rows is None or not isinstance(message, StateEstimate | ParameterEstimate):
             return
         self._rows_bed = self._rows_bed or bed
@@ -307,6 +333,21 @@ def event_time(time_ns: int) -> str:
 def event_line(bed: str, event: Event) -> str:
     channel = f" {event.channel}" if event.channel else ""
     return printable(f"{bed}  {event_time(event.header.time_ns)}  EVENT {event.kind}{channel}: {event.text}")
+
+
+def beat_line(bed: str, beat: BeatEstimate) -> str:
+    """A beat with the bands of its figures; systolic and diastolic pressure go without, to keep the line short."""
+    parts = [bed, event_time(beat.header.time_ns), "BEAT"]
+    for name, short, digits in BEAT_FIGURES:
+        if name in beat.names:
+            figure = banded(short, [beat.value(name, s) for s in BAND], digits)
+            parts.append(f"{figure} {beat.unit(name)}".rstrip())
+    if all(name in beat.names for name in BEAT_PRESSURES):
+        systolic, diastolic, mean = BEAT_PRESSURES
+        pressures = f"P_a {beat.value(systolic, 'mean'):.0f}/{beat.value(diastolic, 'mean'):.0f}"
+        mean_band = banded("mean", [beat.value(mean, s) for s in BAND], ".1f")
+        parts.append(f"{pressures} {mean_band} {beat.unit(mean)}".rstrip())
+    return printable("  ".join(parts))
 
 
 def printable(text: str) -> str:

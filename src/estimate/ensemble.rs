@@ -12,7 +12,7 @@ use super::coupling::{coupled, coupled_unknowns, independent_unknowns};
 pub use super::member::Member;
 use super::random::exact_normals;
 use super::rivals::Unscented;
-use super::settings::{CouplingKind, EstimatorSettings, SettingsError};
+use super::settings::{ChannelSettings, CouplingKind, EstimatorSettings, SettingsError};
 use super::smoother::{Correction, Remembered, Smoother};
 use super::statistics::{Explainers, Summary, mean_and_sd, summarise};
 use super::time::EventTime;
@@ -253,10 +253,9 @@ impl<M: Model> Ensemble<M> {
             let belief = &settings.beliefs[p];
             Pace::new(belief.drift, belief.reversion, *centre, belief.sd)
         };
-        let adaptation = settings.adaptation;
         let mut ensemble = Self {
             paces: estimated.iter().zip(&centre).map(pace).collect(),
-            fits: settings.channels.iter().map(|_| ChannelFit::new(adaptation.noise, adaptation.excess)).collect(),
+            fits: settings.channels.iter().map(|c| channel_fit(&settings, c)).collect(),
             members,
             model,
             settings,
@@ -716,13 +715,16 @@ impl<M: Model> Ensemble<M> {
     pub(super) fn wander_for(&mut self, dt: f64) {
         let drift = &self.settings.drift;
         let excess: Vec<f64> = self.fits.iter().map(ChannelFit::excess).collect();
-        let largest = excess.iter().copied().fold(1.0, f64::max);
         let own = |state: usize| self.settings.channels.iter().position(|c| c.state == state);
         let states: Vec<(usize, f64)> = drift
             .states
             .iter()
             .enumerate()
-            .map(|(s, sd)| (s, sd * own(s).map_or(largest, |c| excess[c]) * dt.sqrt()))
+            .map(|(s, sd)| {
+                // What no sensor shows is not made worse on its account.
+                let extra = own(s).map_or(*sd, |c| sd * excess[c]);
+                (s, extra * dt.sqrt())
+            })
             .filter(|(_, sd)| *sd > 0.0)
             .collect();
         let adaptive = self.settings.adaptation.pace && self.settings.coupling == CouplingKind::Coupled;
@@ -968,6 +970,12 @@ pub struct Snapshot {
     values: Vec<f64>,
     row: Vec<f64>,
     phi: Vec<f64>,
+}
+
+fn channel_fit(settings: &EstimatorSettings, channel: &ChannelSettings) -> ChannelFit {
+    let stated = settings.drift.states[channel.state];
+    let most = if stated > 0.0 { settings.adaptation.excess / stated } else { 1.0 };
+    ChannelFit::new(settings.adaptation.noise, most)
 }
 
 fn check<M: Model>(model: &M, settings: &EstimatorSettings) -> Result<(), SettingsError> {

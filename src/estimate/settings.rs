@@ -125,8 +125,8 @@ pub struct Adaptation {
     pub pace: bool,
     /// Bounds of the sensors' noise found, in units of the one stated; (1, 1) leaves it.
     pub noise: (f64, f64),
-    /// Largest process noise of a state whose sensor says that the model does not fit, in units of the one stated; 1
-    /// leaves it.
+    /// Largest process noise of a state whose sensor says that the model does not fit, in its unit per square root of a
+    /// second; 0 leaves the one stated.
     pub excess: f64,
     /// Innovations beyond this many sd count as this many; infinite leaves all.
     pub outlier_sd: f64,
@@ -134,10 +134,10 @@ pub struct Adaptation {
 
 impl Adaptation {
     /// Everything as stated.
-    pub const OFF: Self = Self { pace: false, noise: (1.0, 1.0), excess: 1.0, outlier_sd: f64::INFINITY };
+    pub const OFF: Self = Self { pace: false, noise: (1.0, 1.0), excess: 0.0, outlier_sd: f64::INFINITY };
 
     /// What suits signals from people.
-    pub const ON: Self = Self { pace: true, noise: (0.4, 3.0), excess: 1e4, outlier_sd: 4.0 };
+    pub const ON: Self = Self { pace: true, noise: (0.4, 3.0), excess: 10.0, outlier_sd: 4.0 };
 }
 
 /// What an estimator does beside its windows.

@@ -192,6 +192,7 @@ impl Twin<'_> {
     fn hear(&mut self, output: &Output) {
         match output {
             Output::Estimate(estimate) => self.estimate(Stream::Live, estimate),
+            Output::Smoothed(estimate) => self.estimate(Stream::Smoothed, estimate),
             Output::Beat(beat) => self.beat(beat),
             Output::Notice(notice) => {
                 let settings = self.estimator.settings();
@@ -199,7 +200,7 @@ impl Twin<'_> {
                 self.notice(notice.kind.name(), channel, notice.time.as_s());
             }
             // How windows went is not scored.
-            _ => {}
+            Output::Window(_) => {}
         }
     }
 
