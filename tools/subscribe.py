@@ -73,9 +73,9 @@ BEAT_FIGURES = (
     ("heart_rate", "HR", ".1f"),
     ("stroke_volume", "SV", ".1f"),
     ("cardiac_output", "CO", ".2f"),
-    ("ejection_fraction", "EF", ".2f"),
-    ("svr", "SVR", "#.3g"),
-    ("pvr", "PVR", "#.3g"),
+    ("ejection_fraction", "EF", ".3f"),
+    ("svr", "SVR", ".3f"),
+    ("pvr", "PVR", ".4f"),
 )
 """Clinical quantities in the line of a beat, as they are called there, and their digits."""
 BEAT_PRESSURES = ("p_a_systolic", "p_a_diastolic", "p_a_mean")

@@ -10,10 +10,14 @@ from typing import Any
 
 import numpy as np
 from hemostream_wire import (
+    BEAT_STATISTICS,
     FLAG_LAST_BLOCK,
     MAX_PAYLOAD_BYTES,
     PARAMETER_STATISTICS,
     STATE_STATISTICS,
+    BeatEstimate,
+    Beats,
+    ChannelStatus,
     Event,
     Malformed,
     Members,
@@ -51,10 +55,10 @@ def texts(*values: str) -> bytes:
     return u64(len(values)) + b"".join(map(text, values))
 
 
-# schema 1, seed 42, configuration hash 0x0123456789abcdef, sequence 7, time 1.5 s
-HEADER = bytes.fromhex("0100 2a00000000000000 efcdab8967452301 0700000000000000 002f685900000000")
+# schema 2, seed 42, configuration hash 0x0123456789abcdef, sequence 7, time 1.5 s
+HEADER = bytes.fromhex("0200 2a00000000000000 efcdab8967452301 0700000000000000 002f685900000000")
 HEADER_JSON = {
-    "schema": 1,
+    "schema": 2,
     "seed": 42,
     "config_hash": "0123456789abcdef",
     "sequence": 7,
@@ -63,7 +67,7 @@ HEADER_JSON = {
 
 # One sample of 80.5 mmHg every 8 ms from 2 s on, twice.
 BLOCK = bytes.fromhex(
-    "0100"  # schema
+    "0200"  # schema
     "0300000000000000"  # sequence
     "01000000"  # flags
     "0094357700000000"  # start_ns
@@ -92,15 +96,53 @@ STATE_JSON = HEADER_JSON | {
     },
 }
 
-PARAMETER = HEADER + bytes.fromhex("63000000") + texts("r_pv", "c_a") + floats(*range(11), math.nan)
-PARAMETER_JSON = HEADER_JSON | {
+PARAMETER = HEADER + bytes.fromhex("63000000") + texts("r_pv", "c_a") + floats(*range(6), 1, *range(6, 11), math.nan, 0)
+PARAMETER_JSON: dict[str, Any] = HEADER_JSON | {
     "members": 99,
     "names": ["r_pv", "c_a"],
     "parameters": {
-        "c_a": {"mean": 6.0, "sd": 7.0, "q05": 8.0, "q95": 9.0, "identifiability": 10.0, "since_informed_s": None},
-        "r_pv": {"mean": 0.0, "sd": 1.0, "q05": 2.0, "q95": 3.0, "identifiability": 4.0, "since_informed_s": 5.0},
+        "c_a": {
+            "mean": 6.0,
+            "sd": 7.0,
+            "q05": 8.0,
+            "q95": 9.0,
+            "identifiability": 10.0,
+            "since_informed_s": None,
+            "identifiable": False,
+        },
+        "r_pv": {
+            "mean": 0.0,
+            "sd": 1.0,
+            "q05": 2.0,
+            "q95": 3.0,
+            "identifiability": 4.0,
+            "since_informed_s": 5.0,
+            "identifiable": True,
+        },
     },
 }
+
+# From 1.5 s to 2.25 s.
+BEAT = (
+    HEADER
+    + bytes.fromhex("64000000")
+    + bytes.fromhex("80461c8600000000")
+    + texts("heart_rate", "ejection_fraction")
+    + texts("bpm", "")
+    + floats(80, 0.5, 79, 81, 0.6, math.nan, 0.55, 0.65)
+)
+BEAT_JSON: dict[str, Any] = HEADER_JSON | {
+    "members": 100,
+    "end_ns": 2_250_000_000,
+    "names": ["heart_rate", "ejection_fraction"],
+    "quantities": {
+        "ejection_fraction": {"mean": 0.6, "sd": None, "q05": 0.55, "q95": 0.65, "unit": ""},
+        "heart_rate": {"mean": 80.0, "sd": 0.5, "q05": 79.0, "q95": 81.0, "unit": "bpm"},
+    },
+}
+
+BEATS = bytes.fromhex("0200 0200000000000000 002f685900000000 ffffffffffffffff")
+BEATS_JSON = {"schema": 2, "onsets_ns": [1_500_000_000, -1]}
 
 MEMBERS = HEADER + texts("p_l", "p_a", "r_pv") + floats(1, 2, 3, 4, 5, 6)
 MEMBERS_JSON = HEADER_JSON | {"names": ["p_l", "p_a", "r_pv"], "members": [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]}
@@ -123,9 +165,16 @@ STATUS = (
     + text("live")
     + struct.pack("<q", 1_499_000_000)
     + u64(4988)
+    + f64(math.nan, 1.5, 1.25, 0.875)
+    + b"\x01"
+    + text("flat")
+    + u64(2)
+    + text("p_l")
+    + f64(0.25)
+    + text("c_a")
     + f64(math.nan)
 )
-STATUS_JSON = HEADER_JSON | {
+STATUS_JSON: dict[str, Any] = HEADER_JSON | {
     "members_alive": 98,
     "members": 100,
     "windows": 5000,
@@ -145,18 +194,24 @@ STATUS_JSON = HEADER_JSON | {
             "last_sample_ns": 1_499_000_000,
             "samples_used": 4988,
             "innovation_rms": None,
+            "noise_sd": 1.5,
+            "whiteness": 1.25,
+            "recurrence": 0.875,
+            "misfit": True,
+            "artefact": "flat",
         }
     ],
+    "disagreement": {"c_a": None, "p_l": 0.25},
 }
 
 EVENT = HEADER + bytes.fromhex("0300000000000000") + b"gap" + text("p_a") + text("nichts für 2 s")
 EVENT_JSON = HEADER_JSON | {"kind": "gap", "channel": "p_a", "text": "nichts für 2 s"}
 
-TRUTH = bytes.fromhex("0100 ffffffffffffffff") + texts("p_a", "r_pv") + floats(91.5, 0.08)
-TRUTH_JSON = {"schema": 1, "time_ns": -1, "names": ["p_a", "r_pv"], "values": {"p_a": 91.5, "r_pv": 0.08}}
+TRUTH = bytes.fromhex("0200 ffffffffffffffff") + texts("p_a", "r_pv") + floats(91.5, 0.08)
+TRUTH_JSON = {"schema": 2, "time_ns": -1, "names": ["p_a", "r_pv"], "values": {"p_a": 91.5, "r_pv": 0.08}}
 
 BLOCK_JSON = {
-    "schema": 1,
+    "schema": 2,
     "sequence": 3,
     "flags": 1,
     "start_ns": 2_000_000_000,
@@ -168,6 +223,8 @@ ALL: list[tuple[type[Any], bytes, dict[str, Any]]] = [
     (PressureBlock, BLOCK, BLOCK_JSON),
     (StateEstimate, STATE, STATE_JSON),
     (ParameterEstimate, PARAMETER, PARAMETER_JSON),
+    (BeatEstimate, BEAT, BEAT_JSON),
+    (Beats, BEATS, BEATS_JSON),
     (Members, MEMBERS, MEMBERS_JSON),
     (Status, STATUS, STATUS_JSON),
     (Event, EVENT, EVENT_JSON),
@@ -175,10 +232,22 @@ ALL: list[tuple[type[Any], bytes, dict[str, Any]]] = [
 ]
 
 
+def parameter_json(statistic: str, value: Any) -> dict[str, Any]:
+    """The JSON of one parameter, with one statistic replaced."""
+    parameters = {"r_pv": PARAMETER_JSON["parameters"]["r_pv"] | {statistic: value}}
+    return PARAMETER_JSON | {"names": ["r_pv"], "parameters": parameters}
+
+
+def beat_json(statistic: str, value: Any) -> dict[str, Any]:
+    """The JSON of one clinical quantity, with one statistic replaced."""
+    quantities = {"heart_rate": BEAT_JSON["quantities"]["heart_rate"] | {statistic: value}}
+    return BEAT_JSON | {"names": ["heart_rate"], "quantities": quantities}
+
+
 class Contents(unittest.TestCase):
     def test_header(self) -> None:
         header = decode(Event, EVENT).header
-        self.assertEqual((header.schema, header.seed, header.config_hash), (1, 42, 0x0123456789ABCDEF))
+        self.assertEqual((header.schema, header.seed, header.config_hash), (2, 42, 0x0123456789ABCDEF))
         self.assertEqual((header.sequence, header.time_ns), (7, 1_500_000_000))
 
     def test_pressure_block(self) -> None:
@@ -216,9 +285,33 @@ class Contents(unittest.TestCase):
     def test_parameters(self) -> None:
         parameters = decode(ParameterEstimate, PARAMETER)
         self.assertEqual((parameters.members, parameters.names), (99, ("r_pv", "c_a")))
-        self.assertEqual(parameters.values.shape, (2, 6))
+        self.assertEqual(parameters.values.shape, (2, 7))
         self.assertEqual(parameters.value("c_a", "mean"), 6.0)
         self.assertTrue(math.isnan(parameters.value("c_a", "since_informed_s")))
+        twin = from_json(ParameterEstimate, json.dumps(PARAMETER_JSON))
+        for side in (parameters, twin):
+            self.assertEqual([side.is_identifiable(name) for name in ("r_pv", "c_a")], [True, False])
+
+    def test_smoothed_state_has_parameters_too(self) -> None:
+        lengths = bytes(4) + u64(1) + u64(0) + floats(0.0)
+        smoothed = decode(StateEstimate, HEADER + lengths + texts("p_a", "r_pv") + floats(*range(14)))
+        np.testing.assert_array_equal(smoothed.series("r_pv", "mean"), [7.0])
+
+    def test_beat(self) -> None:
+        beat = decode(BeatEstimate, BEAT)
+        self.assertEqual((beat.header.time_ns, beat.end_ns, beat.members), (1_500_000_000, 2_250_000_000, 100))
+        self.assertEqual(beat.names, ("heart_rate", "ejection_fraction"))
+        self.assertEqual((beat.unit("heart_rate"), beat.unit("ejection_fraction")), ("bpm", ""))
+        self.assertEqual([beat.value("heart_rate", s) for s in BEAT_STATISTICS], [80.0, 0.5, 79.0, 81.0])
+        self.assertEqual(beat.value("ejection_fraction", "q95"), 0.65)
+
+    def test_beats_are_encoded_as_they_are_decoded(self) -> None:
+        beats = decode(Beats, BEATS)
+        np.testing.assert_array_equal(beats.onsets_ns, [1_500_000_000, -1])
+        self.assertEqual(beats.encode(), BEATS)
+        self.assertEqual(Beats(np.array([1_500_000_000, -1])).encode(), BEATS)
+        with self.assertRaises(TooLong):
+            Beats(np.zeros(MAX_PAYLOAD_BYTES // 8, dtype=np.int64)).encode()
 
     def test_members(self) -> None:
         members = decode(Members, MEMBERS)
@@ -234,6 +327,18 @@ class Contents(unittest.TestCase):
         channel = status.channels[0]
         self.assertEqual((channel.name, channel.state, channel.samples_used), ("p_a", "live", 4988))
         self.assertEqual(channel.last_sample_ns, 1_499_000_000)
+        self.assertEqual((channel.noise_sd, channel.whiteness, channel.recurrence), (1.5, 1.25, 0.875))
+        self.assertEqual((channel.misfit, channel.artefact), (True, "flat"))
+        self.assertEqual((list(status.disagreement), status.disagreement["p_l"]), (["p_l", "c_a"], 0.25))
+
+    def test_shortest_elements_fit_their_least_length(self) -> None:
+        channel = bytes(ChannelStatus.MIN_BYTES)
+        head = STATUS[: STATUS.index(text("late")) - 8]
+        status = decode(Status, head + u64(1) + bytes(16) + u64(1) + channel + u64(1) + bytes(16))
+        self.assertEqual((status.counters, status.disagreement), ({"": 0}, {"": 0.0}))
+        self.assertEqual((status.channels[0].misfit, status.channels[0].artefact), (False, ""))
+        with self.assertRaisesRegex(Malformed, "length 2 at byte [0-9]+ needs 146 bytes, 145 are left"):
+            decode(Status, head + u64(0) + u64(2) + bytes(145))
 
     def test_event(self) -> None:
         event = decode(Event, EVENT)
@@ -247,7 +352,9 @@ class Contents(unittest.TestCase):
     def test_empty_lists(self) -> None:
         state = decode(StateEstimate, HEADER + bytes(4) + u64(0) * 4)
         self.assertEqual(state.values.shape, (0, 0, 7))
-        self.assertEqual(decode(ParameterEstimate, HEADER + bytes(4) + u64(0) * 2).values.shape, (0, 6))
+        self.assertEqual(decode(ParameterEstimate, HEADER + bytes(4) + u64(0) * 2).values.shape, (0, 7))
+        self.assertEqual(decode(BeatEstimate, HEADER + bytes(4 + 8) + u64(0) * 3).values.shape, (0, 4))
+        self.assertEqual(len(decode(Beats, BEATS[:2] + u64(0)).onsets_ns), 0)
         self.assertEqual(decode(Members, HEADER + u64(0) * 2).values.shape, (0, 0))
 
 
@@ -270,13 +377,13 @@ class Refusals(unittest.TestCase):
     def test_other_schema(self) -> None:
         for kind, payload, body in ALL:
             with self.subTest(kind=kind.__name__):
-                with self.assertRaisesRegex(WrongSchema, "schema version 513, this module reads 1"):
+                with self.assertRaisesRegex(WrongSchema, "schema version 513, this module reads 2"):
                     decode(kind, b"\x01\x02" + payload[2:])
                 # Looked at before anything else: what follows may be of any form.
                 with self.assertRaises(WrongSchema):
-                    decode(kind, b"\x02\x00")
+                    decode(kind, b"\x01\x00")
                 with self.assertRaises(WrongSchema):
-                    from_json(kind, json.dumps(body | {"schema": 2}))
+                    from_json(kind, json.dumps(body | {"schema": 1}))
 
     def test_too_long(self) -> None:
         with self.assertRaises(TooLong):
@@ -291,10 +398,15 @@ class Refusals(unittest.TestCase):
             decode(Members, HEADER + u64(1 << 40) + bytes(64))
 
     def test_wrong_shapes(self) -> None:
-        with self.assertRaisesRegex(Malformed, "`values` has 11 entries, expected 2 x 6"):
+        with self.assertRaisesRegex(Malformed, "`values` has 11 entries, expected 2 x 7"):
             decode(ParameterEstimate, HEADER + bytes(4) + texts("r_pv", "c_a") + floats(*range(11)))
         with self.assertRaisesRegex(Malformed, "`values` has 5 entries, expected 2 x 2"):
             decode(Members, HEADER + texts("p_a", "p_l") + floats(*range(5)))
+        beat = HEADER + bytes(4 + 8)
+        with self.assertRaisesRegex(Malformed, "`values` has 5 entries, expected 1 x 4"):
+            decode(BeatEstimate, beat + texts("svr") + texts("mmHg s/mL") + floats(*range(5)))
+        with self.assertRaisesRegex(Malformed, "0 units for 1 names"):
+            decode(BeatEstimate, beat + texts("svr") + texts() + floats(*range(4)))
         with self.assertRaisesRegex(Malformed, "since_data_s"):
             decode(StateEstimate, HEADER + bytes(4) + u64(0) + floats(1.0) + u64(0) * 2)
         with self.assertRaisesRegex(Malformed, "1 offsets for 2 samples"):
@@ -303,6 +415,17 @@ class Refusals(unittest.TestCase):
     def test_repeated_name(self) -> None:
         with self.assertRaisesRegex(Malformed, "stands twice"):
             decode(Truth, TRUTH[:10] + texts("p_a", "p_a") + floats(1, 2))
+        with self.assertRaisesRegex(Malformed, "stands twice"):
+            decode(Status, STATUS.replace(text("c_a"), text("p_l")))
+
+    def test_flags_that_are_neither_true_nor_false(self) -> None:
+        misfit = STATUS.index(b"\x01" + text("flat"))
+        with self.assertRaisesRegex(Malformed, f"bool at byte {misfit} is 2, expected 0 or 1"):
+            decode(Status, STATUS[:misfit] + b"\x02" + STATUS[misfit + 1 :])
+        for value in (0.5, math.nan):
+            payload = HEADER + bytes(4) + texts("r_pv") + floats(*range(6), value)
+            with self.assertRaisesRegex(Malformed, "`identifiable` holds .*, expected 0 or 1"):
+                decode(ParameterEstimate, payload)
 
     def test_string_that_is_not_utf8(self) -> None:
         with self.assertRaisesRegex(Malformed, "not UTF-8"):
@@ -313,7 +436,7 @@ class Refusals(unittest.TestCase):
             (Event, "{", "not JSON"),
             (Event, "[]", "not a JSON object"),
             (Event, b"\xff\xff", "not JSON"),
-            (Event, '{"schema": 1, "time_ns": ' + "9" * 5000 + "}", "not JSON"),
+            (Event, '{"schema": 2, "time_ns": ' + "9" * 5000 + "}", "not JSON"),
             (Event, {}, "no `schema`"),
             (Event, EVENT_JSON | {"kind": 3}, "`kind` is 3, expected a string"),
             (Event, EVENT_JSON | {"seed": True}, "`seed` is True"),
@@ -326,7 +449,16 @@ class Refusals(unittest.TestCase):
             (ParameterEstimate, PARAMETER_JSON | {"names": ["c_a"], "parameters": {"c_a": {"mean": 1.0}}}, "no `sd`"),
             (Members, MEMBERS_JSON | {"members": [[1.0]]}, "list of 3 numbers"),
             (Members, MEMBERS_JSON | {"members": [[1.0, "2.0", 3.0]]}, "expected a number"),
+            (ParameterEstimate, parameter_json("identifiable", 1.0), "`identifiable` is 1.0, expected true or false"),
+            (ParameterEstimate, parameter_json("mean", True), "expected a number"),
+            (BeatEstimate, beat_json("unit", None), "`unit` is None, expected a string"),
+            (BeatEstimate, beat_json("q05", "79"), "expected a number"),
+            (BeatEstimate, BEAT_JSON | {"names": ["heart_rate"]}, "not those of the numbers"),
+            (Beats, BEATS_JSON | {"onsets_ns": [1.5]}, "`onsets_ns` holds something"),
             (Status, STATUS_JSON | {"channels": [1]}, "not an object"),
+            (Status, STATUS_JSON | {"channels": [STATUS_JSON["channels"][0] | {"misfit": 1}]}, "expected true"),
+            (Status, STATUS_JSON | {"disagreement": []}, "expected an object"),
+            (Status, STATUS_JSON | {"disagreement": {"p_l": "far"}}, "expected a number"),
             (Truth, TRUTH_JSON | {"names": ["p_a"], "values": {"p_a": [1]}}, "expected a number"),
             (Truth, TRUTH_JSON | {"names": ["p_a"]}, "not those of the numbers"),
             (PressureBlock, BLOCK_JSON | {"values": [None]}, "expected a number"),
@@ -355,7 +487,7 @@ class JsonTwins(unittest.TestCase):
     def test_nan_and_infinities_are_null(self) -> None:
         for value in (math.nan, math.inf, -math.inf):
             truth = decode(Truth, TRUTH[:10] + texts("p_a") + floats(value))
-            twin = from_json(Truth, '{"schema": 1, "time_ns": -1, "names": ["p_a"], "values": {"p_a": null}}')
+            twin = from_json(Truth, '{"schema": 2, "time_ns": -1, "names": ["p_a"], "values": {"p_a": null}}')
             self.assertTrue(math.isnan(twin.values[0]))
             self.assertEqual(differences(truth, twin), [])
         self.assertNotEqual(differences(decode(Truth, TRUTH[:10] + texts("p_a") + floats(0.0)), twin), [])
@@ -393,6 +525,8 @@ def changes(body: Any, path: tuple[Any, ...] = ()) -> list[tuple[tuple[Any, ...]
         return [(path, "0123456789abcdee")]
     if body is None:
         return [(path, 0.0)]
+    if isinstance(body, bool):
+        return [(path, not body)]
     return [(path, body + "x" if isinstance(body, str) else body + 1)]
 
 

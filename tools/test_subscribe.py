@@ -22,8 +22,11 @@ from hemostream_rows import MAX_WAITING, ColumnsChanged, RowFile
 from hemostream_twins import MAX_WAITING as MAX_TWINS_WAITING
 from hemostream_twins import TwinCheck
 from hemostream_wire import (
+    BEAT_STATISTICS,
     PARAMETER_STATISTICS,
+    SMOOTHED_KEY,
     STATE_STATISTICS,
+    BeatEstimate,
     Event,
     ParameterEstimate,
     StateEstimate,
@@ -46,11 +49,11 @@ PATIENCE_S = 30.0
 
 
 def header(sequence: int, time_ns: int) -> bytes:
-    return struct.pack("<HQQQq", 1, 42, 0xAB, sequence, time_ns)
+    return struct.pack("<HQQQq", 2, 42, 0xAB, sequence, time_ns)
 
 
 def header_json(sequence: int, time_ns: int) -> dict[str, Any]:
-    return {"schema": 1, "seed": 42, "config_hash": f"{0xAB:016x}", "sequence": sequence, "time_ns": time_ns}
+    return {"schema": 2, "seed": 42, "config_hash": f"{0xAB:016x}", "sequence": sequence, "time_ns": time_ns}
 
 
 def state_values(time_ns: int) -> list[float]:
@@ -59,7 +62,8 @@ def state_values(time_ns: int) -> list[float]:
 
 
 def parameter_values(time_ns: int) -> list[float]:
-    return [(time_ns / 1e9 + i) / 7 for i in range(6)]
+    """Numbers with long decimal forms, all different, and `identifiable`: `[7]`."""
+    return [(time_ns / 1e9 + i) / 7 for i in range(6)] + [1.0]
 
 
 def state_bytes(sequence: int, *times_ns: int) -> bytes:
@@ -85,8 +89,62 @@ def parameter_bytes(sequence: int, time_ns: int, names: tuple[str, ...] = PARAME
 
 
 def parameter_json(sequence: int, time_ns: int) -> dict[str, Any]:
-    values = dict(zip(PARAMETER_STATISTICS, parameter_values(time_ns), strict=True))
+    values: dict[str, Any] = dict(zip(PARAMETER_STATISTICS, parameter_values(time_ns), strict=True))
+    values["identifiable"] = True
     return header_json(sequence, time_ns) | {"members": 100, "names": ["r_pv"], "parameters": {"r_pv": values}}
+
+
+def smoothed_bytes(sequence: int, time_ns: int) -> bytes:
+    body = struct.pack("<I", 100) + u64(1) + struct.pack("<q", time_ns) + floats(0.0)
+    values = [*state_values(time_ns), *map(float, range(7))]
+    return header(sequence, time_ns) + body + texts(*QUANTITY_NAMES, *PARAMETER_NAMES) + floats(*values)
+
+
+def smoothed_json(sequence: int, time_ns: int) -> dict[str, Any]:
+    body = state_json(sequence, time_ns)
+    parameter = {s: [float(i)] for i, s in enumerate(STATE_STATISTICS)}
+    body["names"] = [*QUANTITY_NAMES, *PARAMETER_NAMES]
+    body["quantities"] |= {"r_pv": parameter}
+    return body
+
+
+BEAT_MEANS = {
+    "heart_rate": (80.0, "bpm"),
+    "stroke_volume": (62.5, "mL"),
+    "cardiac_output": (5.0, "L/min"),
+    "ejection_fraction": (0.6, ""),
+    "svr": (1.0, "mmHg s/mL"),
+    "pvr": (0.0625, "mmHg s/mL"),
+    "p_l_systolic": (119.0, "mmHg"),
+    "p_a_systolic": (118.0, "mmHg"),
+    "p_a_diastolic": (76.0, "mmHg"),
+    "p_a_mean": (92.0, "mmHg"),
+}
+BEAT_LINE = (
+    "bed1  1.000 s  BEAT  HR 80.0 [76.0, 84.0] bpm  SV 62.5 [59.4, 65.6] mL  CO 5.00 [4.75, 5.25] L/min"
+    "  EF 0.600 [0.570, 0.630]  SVR 1.000 [0.950, 1.050] mmHg s/mL  PVR 0.0625 [0.0594, 0.0656] mmHg s/mL"
+    "  P_a 118/76 mean 92.0 [87.4, 96.6] mmHg"
+)
+
+
+def beat_values(mean: float) -> list[float]:
+    return [mean, 0.03 * mean, 0.95 * mean, 1.05 * mean]
+
+
+def beat_bytes(sequence: int, time_ns: int, names: tuple[str, ...] = tuple(BEAT_MEANS)) -> bytes:
+    units = texts(*(BEAT_MEANS[name][1] for name in names))
+    values = [value for name in names for value in beat_values(BEAT_MEANS[name][0])]
+    head = header(sequence, time_ns) + struct.pack("<Iq", 100, time_ns + 750_000_000)
+    return head + texts(*names) + units + floats(*values)
+
+
+def beat_json(sequence: int, time_ns: int) -> dict[str, Any]:
+    quantities = {
+        name: dict(zip(BEAT_STATISTICS, beat_values(mean), strict=True)) | {"unit": unit}
+        for name, (mean, unit) in BEAT_MEANS.items()
+    }
+    body = {"members": 100, "end_ns": time_ns + 750_000_000, "names": list(BEAT_MEANS), "quantities": quantities}
+    return header_json(sequence, time_ns) | body
 
 
 def event_bytes(sequence: int, time_ns: int, words: str) -> bytes:
@@ -99,13 +157,14 @@ def event_json(sequence: int, time_ns: int, words: str) -> dict[str, Any]:
 
 def status_bytes(sequence: int, time_ns: int) -> bytes:
     lags = f64(0.5, 3.25, 9.0, 0.75, 2.5)
-    return header(sequence, time_ns) + struct.pack("<IIQQ", 100, 100, 5, 0) + lags + bytes(8 + 4 + 8 + 8)
+    return header(sequence, time_ns) + struct.pack("<IIQQ", 100, 100, 5, 0) + lags + bytes(8 + 4 + 8 + 8 + 8)
 
 
 def status_json(sequence: int, time_ns: int) -> dict[str, Any]:
     counts = ("windows_without_data", "not_converged", "queue_depth")
     lags = {"lag_p50_ms": 0.5, "lag_p99_ms": 3.25, "lag_max_ms": 9.0, "solve_ms": 0.75, "iterations": 2.5}
-    rest = {"members_alive": 100, "members": 100, "windows": 5, "counters": {}, "channels": []}
+    rest: dict[str, Any] = {"members_alive": 100, "members": 100, "windows": 5, "counters": {}, "channels": []}
+    rest["disagreement"] = {}
     return header_json(sequence, time_ns) | dict.fromkeys(counts, 0) | lags | rest
 
 
@@ -296,6 +355,42 @@ class Parts(unittest.TestCase):
         self.assertEqual(bed.line("bed1", 10.5), expected)
         self.assertEqual(bed.line("bed1", 17.0), expected + "  SILENT for 7 s")
 
+    def test_parameter_that_is_not_identifiable_is_marked(self) -> None:
+        bed = subscribe.Bed()
+        values = floats(*parameter_values(1_000_000_000)[:6], 1, *parameter_values(1_000_000_000)[:6], 0)
+        payload = header(1, 1_000_000_000) + struct.pack("<I", 100) + texts("r_pv", "c_a") + values
+        bed.take(decode(ParameterEstimate, payload), 10.0)
+        figures = "0.1429 [0.4286, 0.5714]"
+        expected = f"bed1  no state yet  r_pv {figures}  c_a {figures} (not identifiable)  lag p99 -"
+        self.assertEqual(bed.line("bed1", 10.5), expected)
+
+    def test_beat_line(self) -> None:
+        beat = decode(BeatEstimate, beat_bytes(1, 1_000_000_000))
+        self.assertEqual(subscribe.beat_line("bed1", beat), BEAT_LINE)
+        # Another model may have fewer.
+        beat = decode(BeatEstimate, beat_bytes(1, 1_000_000_000, ("p_a_mean", "heart_rate")))
+        self.assertEqual(subscribe.beat_line("bed1", beat), BEAT_LINE.partition("  SV")[0])
+
+    def test_smoothed_estimates_are_neither_shown_nor_written(self) -> None:
+        with tempfile.TemporaryDirectory() as directory:
+            path = Path(directory) / "out.csv"
+            rows = RowFile(path)
+            follower = subscribe.Follower("p", False, rows, None)
+            messages = [
+                ("estimate/state", state_bytes(1, 20)),
+                ("estimate/parameters", parameter_bytes(1, 20)),
+                (SMOOTHED_KEY, smoothed_bytes(1, 10)),
+                ("estimate/state", state_bytes(2, 40)),
+                ("estimate/parameters", parameter_bytes(2, 40)),
+            ]
+            for topic, payload in messages:
+                follower.handle(subscribe.Received(f"p/bed1/{topic}", payload, False), 0.0)
+            rows.close()
+            self.assertEqual(path.read_text().splitlines(), [HEADER_ROW, expected_row(20), expected_row(40)])
+        shown = follower.beds["bed1"].state
+        self.assertEqual(shown.header.time_ns if shown else None, 40)
+        self.assertEqual((follower.received, follower.problems()), (5, []))
+
     def test_beds_are_bounded(self) -> None:
         follower = subscribe.Follower("p", False, None, None)
         with contextlib.redirect_stderr(io.StringIO()) as complaints:
@@ -396,6 +491,8 @@ class Loopback(InDirectory):
             "estimate/state": (state_bytes(0, 0), state_json(0, 0)),
             "estimate/parameters": (parameter_bytes(0, 0), parameter_json(0, 0)),
             "status": (status_bytes(0, 0), status_json(0, 0)),
+            "estimate/smoothed": (smoothed_bytes(0, -1), smoothed_json(0, -1)),
+            "estimate/beat": (beat_bytes(0, 0), beat_json(0, 0)),
         }
         for topic, (payload, twin) in stored.items():
             self.publisher.last[f"hemostream/bed1/{topic}"] = payload
@@ -404,12 +501,15 @@ class Loopback(InDirectory):
             for sequence, time_ns in enumerate(times):
                 if sequence:
                     self.publish(sequence, time_ns)
+            self.publisher.put(SMOOTHED_KEY, smoothed_bytes(1, 5), smoothed_json(1, 5))
+            self.publisher.put("estimate/beat", beat_bytes(1, 1_000_000_000), beat_json(1, 1_000_000_000))
             self.publisher.put("event", event_bytes(0, 5, "over"), event_json(0, 5, "over"))
             last = f"{parameter_values(times[-1])[0]:#.4g}"
             seen = self.read_until(process, lambda line: "0.980 s" in line and last in line)
             code, complaints = self.interrupt(process)
         self.assertEqual(code, 0, complaints)
         self.assertIn("bed1  0.000 s  EVENT gap p_a: over", seen)
+        self.assertEqual(seen.count(BEAT_LINE), 1)
         self.assertIn("lag p99 3.2 ms", seen[-1])
         self.assertRegex(complaints, r"\b(9[89]|10\d) pairs compared, 0 differ, 0 messages without twin")
         self.assertIn("50 rows of bed1 written, 0 without parameters", complaints)
@@ -468,13 +568,13 @@ class Loopback(InDirectory):
 
     def test_garbage_is_reported_and_passed_over(self) -> None:
         with self.subscriber() as process:
-            self.publisher.put("event", b"\x01\x00garbage")
+            self.publisher.put("event", b"\x02\x00garbage")
             self.publisher.put("event", b"\x09\x00")
             self.publisher.put("event", event_bytes(0, 5, "sound"))
             self.read_until(process, lambda line: "sound" in line)
             code, complaints = self.interrupt(process)
         self.assertEqual(code, 1)
-        self.assertIn("schema version 9, this module reads 1", complaints)
+        self.assertIn("schema version 9, this module reads 2", complaints)
         self.assertIn("failed: 2 undecodable messages", complaints)
 
     def test_nothing_to_hear(self) -> None:

@@ -226,7 +226,7 @@ impl<M: Model> Ensemble<M> {
         let transforms: Vec<_> = estimated.iter().map(|&p| model.parameters()[p].transform).collect();
         let unknowns = match settings.coupling {
             CouplingKind::Independent => independent_unknowns(&estimated),
-            _ => coupled_unknowns(&estimated, &transforms),
+            _ => coupled_unknowns(&model, &estimated, &transforms),
         };
         let mut rng = ChaCha8Rng::seed_from_u64(settings.seed);
         let mut theta = settings.theta.clone();
@@ -463,12 +463,13 @@ impl<M: Model> Ensemble<M> {
             }
         }
         let per_s = self.rate_hz().unwrap_or(0.0);
-        self.shift_clocks(|beats| (beats + ahead_s * per_s).round() - ahead_s * per_s);
-        if !known {
-            for (member, e) in self.members.iter_mut().zip(&draws[m..]) {
-                let phase = member.theta[cycle.phase] + PHASE_SD * e;
-                self.model.set_clock(phase, &mut member.x, &mut member.theta);
-            }
+        let beats = self.cycles().unwrap_or(0.0);
+        let target = (beats + ahead_s * per_s).round() - ahead_s * per_s;
+        for (member, e) in self.members.iter_mut().zip(&draws[m..]) {
+            // A new rhythm leaves nothing of what the members thought of the old one.
+            let own = if rate.is_some() { 0.0 } else { member.theta[cycle.phase] - beats };
+            let phase = target + own + if known { 0.0 } else { PHASE_SD * e };
+            self.model.set_clock(phase, &mut member.x, &mut member.theta);
         }
     }
 

@@ -3,18 +3,21 @@
 pub mod coupled;
 pub mod independent;
 
-use crate::model::Transform;
+use crate::model::{Model, Transform};
 use crate::xtfc::problem::Unknowns;
 
 /// The unknowns of the coupled ensemble: initial state and parameters, each in its own coordinate.
 #[must_use]
-pub fn coupled_unknowns(parameters: &[usize], transforms: &[Transform]) -> Unknowns {
+pub fn coupled_unknowns<M: Model>(model: &M, parameters: &[usize], transforms: &[Transform]) -> Unknowns {
+    let phase = model.cycle().map(|cycle| cycle.phase);
+    // A trust region. A quarter is far beyond any sensible update; a clock that moves further than this in one step
+    // leaves the part of the beat in which its effect was linear.
+    let max_step = |p: &usize| if Some(*p) == phase { 0.02 } else { 0.25 };
     Unknowns {
         initial_state: true,
         parameters: parameters.to_vec(),
         transforms: transforms.to_vec(),
-        // A factor of two, or one typical size, per Gauss-Newton step: far beyond any sensible update.
-        max_steps: vec![std::f64::consts::LN_2; parameters.len()],
+        max_steps: parameters.iter().map(max_step).collect(),
     }
 }
 
