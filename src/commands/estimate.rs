@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use hemostream::edge::config::Config;
-use hemostream::edge::files::csv::{TableWriter, beat_header, beat_row, estimate_header, estimate_row};
+use hemostream::edge::files::csv::{EventWriter, TableWriter, beat_header, beat_row, estimate_header, estimate_row};
 use hemostream::edge::files::record::Record;
 use hemostream::edge::outlet::notice_text;
 use hemostream::estimate::estimator::{Estimator, Input, Output};
@@ -17,7 +17,7 @@ use hemostream::runtime::clock::Clock;
 use hemostream::runtime::workers::Workers;
 use indicatif::ProgressBar;
 
-use super::{ConfigArgs, Failure, failed, progress_bar, say};
+use super::{ConfigArgs, Failure, failed, log_to_stderr, progress_bar, say};
 
 /// Run the estimator over a record, as fast as the machine goes
 #[derive(Args)]
@@ -37,6 +37,9 @@ pub(crate) struct Estimate {
     /// Where to write what is read off each heart beat (CSV): stroke volume, cardiac output, resistances, pressures
     #[arg(long, value_name = "FILE")]
     beats: Option<PathBuf>,
+    /// Where to write what happened (CSV): artefacts, beats missed, parameters that moved, a model that does not fit
+    #[arg(long, value_name = "FILE")]
+    events: Option<PathBuf>,
     /// Worker threads, over the configuration; 0 is one per core
     #[arg(long)]
     threads: Option<usize>,
@@ -51,8 +54,9 @@ pub(crate) fn whole(value: f64) -> u64 {
 impl Estimate {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
+        log_to_stderr("hemostream=warn,warn");
         let known = |e: &str| e.eq_ignore_ascii_case("csv");
-        for output in [Some(&self.output), self.beats.as_ref()].into_iter().flatten() {
+        for output in [Some(&self.output), self.beats.as_ref(), self.events.as_ref()].into_iter().flatten() {
             if !output.extension().and_then(|e| e.to_str()).is_some_and(known) {
                 let message = format!("{}: found another ending, expected .csv", output.display());
                 return Err(Failure::Input(message));
@@ -65,7 +69,7 @@ impl Estimate {
         // Read it to the end once: a bad cell is reported before anything is computed or written.
         let seconds = check_record(input, &config)?;
         let reader = Record::open(input, &config)?;
-        let mut run = Run::new(&config, &self.output, self.beats.as_deref(), &reader, seconds)?;
+        let mut run = Run::new(&config, self, &reader, seconds)?;
         run.record(reader, &workers)?;
         run.finish(&workers)
     }
@@ -89,6 +93,7 @@ struct Run {
     channels: Vec<Option<usize>>,
     table: TableWriter,
     beats: Option<TableWriter>,
+    events: Option<EventWriter>,
     /// Whether the table holds what is known after the smoothing lag.
     smoothed: bool,
     outputs: Vec<Output>,
@@ -103,13 +108,7 @@ struct Run {
 }
 
 impl Run {
-    fn new(
-        config: &Config,
-        output: &Path,
-        beats: Option<&Path>,
-        reader: &Record,
-        seconds: f64,
-    ) -> Result<Self, Failure> {
+    fn new(config: &Config, args: &Estimate, reader: &Record, seconds: f64) -> Result<Self, Failure> {
         let model = config.circulation()?;
         let estimator = Estimator::new(model.clone(), config.estimator_settings()?).map_err(failed)?;
         let channel = |state: &usize| estimator.settings().channels.iter().position(|c| c.state == *state);
@@ -123,8 +122,9 @@ impl Run {
         }
         let progress = progress_bar(whole(seconds), "{bar:40} {pos}/{len} s  {eta} left");
         Ok(Self {
-            table: TableWriter::create(output, &estimate_header(&model, estimator.estimated()))?,
-            beats: beats.map(|path| TableWriter::create(path, &beat_header(&model))).transpose()?,
+            table: TableWriter::create(&args.output, &estimate_header(&model, estimator.estimated()))?,
+            events: args.events.as_deref().map(EventWriter::create).transpose()?,
+            beats: args.beats.as_deref().map(|path| TableWriter::create(path, &beat_header(&model))).transpose()?,
             smoothed: config.estimator.smoothing_lag_s > 0.0,
             estimator,
             channels,
@@ -182,13 +182,11 @@ impl Run {
                     self.notices += 1;
                     let (channel, model) = (notice.channel, self.estimator.model());
                     let name = channel.map_or("", |c| model.states()[self.estimator.settings().channels[c].state].name);
-                    tracing::info!(
-                        time_s = notice.time.as_s(),
-                        channel = name,
-                        "{}: {}",
-                        notice.kind.name(),
-                        notice_text(model, notice.kind)
-                    );
+                    let text = notice_text(model, notice.kind);
+                    if let Some(events) = &mut self.events {
+                        events.row(notice.time, notice.kind.name(), name, &text)?;
+                    }
+                    tracing::info!(time_s = notice.time.as_s(), channel = name, "{}: {text}", notice.kind.name());
                 }
             }
         }
@@ -202,6 +200,9 @@ impl Run {
         self.table.finish()?;
         if let Some(beats) = self.beats {
             beats.finish()?;
+        }
+        if let Some(events) = self.events {
+            events.finish()?;
         }
         let wall = hemostream::estimate::time::s_from_ns(self.clock.now().0);
         let member_windows = self.windows as f64 * self.estimator.settings().members as f64;

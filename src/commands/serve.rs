@@ -84,7 +84,7 @@ pub(crate) async fn asked_to_stop() {
 impl Serve {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
-        log_to_stderr();
+        log_to_stderr("hemostream=info,warn");
         tokio_runtime()?.block_on(async {
             let bus = ZenohBus::open(&config.zenoh)?;
             let running = Running::start(Arc::new(bus.clone()), &config)?;

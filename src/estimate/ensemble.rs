@@ -341,9 +341,9 @@ impl<M: Model> Ensemble<M> {
     fn coupled_step(&mut self, observations: &[Observation], h: f64, parallel: &dyn Parallel) -> WindowReport {
         let mut report = self.look(observations, h, parallel);
         if self.settings.adaptation.pace && self.listening {
-            let clocks: Vec<usize> = (0..self.estimated.len()).filter(|k| self.is_clock(*k)).collect();
+            let learnt: Vec<bool> = (0..self.estimated.len()).map(|k| self.learns_pace(k)).collect();
             for (k, pace) in self.paces.iter_mut().enumerate() {
-                if pace.advance(h) && !clocks.contains(&k) {
+                if pace.advance(h) && learnt[k] {
                     report.moving.push(k);
                 }
             }
@@ -354,11 +354,14 @@ impl<M: Model> Ensemble<M> {
         report
     }
 
-    /// Whether an estimated parameter is part of the clock. Its phase moves by itself, which is no pace of its own, and its
-    /// rate is heard of once in a beat only: what is larger than their drift is left to those who listen for beats.
-    fn is_clock(&self, k: usize) -> bool {
+    /// Whether the pace of an estimated parameter is learnt. Where a pull to a centre is believed in, pace and pull are a
+    /// statement about how far it gets, to be left as it is. The phase of the clock moves by itself, which is no pace of
+    /// its own, and its rate is heard of once in a beat only: what is larger than their drift is left to those who listen
+    /// for beats.
+    fn learns_pace(&self, k: usize) -> bool {
         let p = self.estimated[k];
-        self.model.cycle().is_some_and(|cycle| cycle.phase == p || cycle.rate == p)
+        let is_clock = self.model.cycle().is_some_and(|cycle| cycle.phase == p || cycle.rate == p);
+        !is_clock && self.settings.beliefs[p].reversion <= 0.0
     }
 
     /// One window, remembered.
@@ -735,7 +738,7 @@ impl<M: Model> Ensemble<M> {
             .enumerate()
             .map(|(k, &p)| {
                 let belief = &self.settings.beliefs[p];
-                let learnt = adaptive && !self.is_clock(k);
+                let learnt = adaptive && self.learns_pace(k);
                 let pace = if learnt { self.paces[k].now() } else { belief.drift };
                 (k, (-belief.reversion * dt).exp(), pace * diffusion(belief.reversion, dt).sqrt())
             })

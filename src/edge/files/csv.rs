@@ -215,6 +215,42 @@ impl TableWriter {
     }
 }
 
+/// Writes what happened, row by row: `time_s, kind, channel, text`.
+pub struct EventWriter {
+    path: PathBuf,
+    writer: csv::Writer<File>,
+}
+
+impl EventWriter {
+    /// Creates the file and writes the header.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn create(path: &Path) -> Result<Self, CsvError> {
+        let file = File::create(path).map_err(|e| file_error(path, &e))?;
+        let mut writer = csv::Writer::from_writer(file);
+        writer.write_record(["time_s", "kind", "channel", "text"]).map_err(|e| file_error(path, &e))?;
+        Ok(Self { path: path.to_owned(), writer })
+    }
+
+    /// Writes a row.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn row(&mut self, time: EventTime, kind: &str, channel: &str, text: &str) -> Result<(), CsvError> {
+        let time = time.as_s().to_string();
+        self.writer.write_record([time.as_str(), kind, channel, text]).map_err(|e| file_error(&self.path, &e))
+    }
+
+    /// Writes what is buffered.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn finish(mut self) -> Result<(), CsvError> {
+        self.writer.flush().map_err(|e| file_error(&self.path, &e))
+    }
+}
+
 /// Header of an estimate file: `time_s`, seven statistics per quantity, four per parameter.
 #[must_use]
 pub fn estimate_header(model: &Circulation, estimated: &[usize]) -> Vec<String> {
