@@ -6,7 +6,7 @@
 //! none that a Gaussian could mend (a premature beat, a pause, a rhythm that changes): then the clock is set, at the
 //! time at which it went wrong, and the windows since are solved again.
 
-use super::signal::onset::{OnsetDetector, OnsetSettings, RateTracker};
+use super::signal::onset::{OnsetDetector, OnsetSettings, RateTracker, Recent};
 
 /// Error of the clock that the ensemble is not left alone with \[beats\].
 const SURPRISE: f64 = 0.05;
@@ -21,9 +21,8 @@ const SAME_RHYTHM: f64 = 0.15;
 /// Phase at which a clock without a beat waits for one: the ventricles are relaxed.
 pub const WAITING_PHASE: f64 = 0.97;
 
-/// Delay of an upstroke after the beginning of the beat that is possible, and its change from beat to beat \[s\].
+/// Longest delay of an upstroke after the beginning of the beat \[s\].
 const MAX_DELAY_S: f64 = 0.35;
-const NEAR_S: f64 = 0.04;
 
 /// Where the beat comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -90,8 +89,9 @@ pub struct Heard {
 struct Ear {
     observed: OnsetDetector,
     expected: OnsetDetector,
-    /// From the beginning of a beat to its upstroke here \[s\].
-    delay_s: Option<f64>,
+    /// From the beginning of a beat to its upstroke here \[s\], in the last beats. Members that follow the data rise with a
+    /// beat that they did not expect, which is no delay: the median leaves such a beat out.
+    delays_s: Recent,
 }
 
 /// Follows the beat.
@@ -133,7 +133,7 @@ impl BeatTracker {
         let ear = || Ear {
             observed: OnsetDetector::new(OnsetSettings::default()),
             expected: OnsetDetector::new(OnsetSettings::default()),
-            delay_s: None,
+            delays_s: Recent::default(),
         };
         Self {
             source,
@@ -192,14 +192,12 @@ impl BeatTracker {
             if let Some(onset) = ear.expected.take(sample.time_s, sample.expected) {
                 let beats = clock.beats_at(onset.time_s);
                 let delay_s = (beats - beats.floor()) / clock.rate_hz;
-                // Members that follow the data rise with a beat that they did not expect: that is no delay.
-                let plausible = ear.delay_s.map_or(delay_s < MAX_DELAY_S, |known| (delay_s - known).abs() < NEAR_S);
-                if plausible && !self.waiting {
-                    ear.delay_s = Some(ear.delay_s.map_or(delay_s, |known| known + 0.3 * (delay_s - known)));
+                if delay_s < MAX_DELAY_S && !self.waiting {
+                    ear.delays_s.push(delay_s);
                 }
             }
             let onset = ear.observed.take(sample.time_s, sample.observed);
-            if let (Some(onset), Some(delay_s), true) = (onset, ear.delay_s, self.active == Some(sample.channel)) {
+            if let (Some(onset), Some(delay_s), true) = (onset, ear.delays_s.median(), self.active == Some(sample.channel)) {
                 self.rate.take(&onset);
                 self.beat(onset.time_s - delay_s, clock, false, &mut found);
             }
@@ -244,7 +242,7 @@ impl BeatTracker {
             }
             return;
         };
-        let (Some(delay_s), Some(last_beat_s)) = (self.ears[channel].delay_s, self.last_beat_s) else { return };
+        let (Some(delay_s), Some(last_beat_s)) = (self.ears[channel].delays_s.median(), self.last_beat_s) else { return };
         if !self.acquired || self.waiting || !found.edits.is_empty() {
             return;
         }

@@ -343,12 +343,13 @@ impl RateTracker {
 
 /// The last few values of something.
 #[derive(Debug, Clone, Default)]
-struct Recent {
+pub struct Recent {
     values: VecDeque<f64>,
 }
 
 impl Recent {
-    fn push(&mut self, value: f64) {
+    /// Adds a value; the oldest goes.
+    pub fn push(&mut self, value: f64) {
         if self.values.len() == MEMORY {
             self.values.pop_front();
         }
@@ -356,7 +357,8 @@ impl Recent {
     }
 
     /// Of an even number, the lower one in the middle: the first flush is not half of what is usual.
-    fn median(&self) -> Option<f64> {
+    #[must_use]
+    pub fn median(&self) -> Option<f64> {
         let mut sorted = [f64::INFINITY; MEMORY];
         for (slot, value) in sorted.iter_mut().zip(&self.values) {
             *slot = *value;
