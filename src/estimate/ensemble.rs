@@ -719,14 +719,16 @@ impl<M: Model> Ensemble<M> {
     pub(super) fn wander_for(&mut self, dt: f64) {
         let drift = &self.settings.drift;
         let excess: Vec<f64> = self.fits.iter().map(ChannelFit::excess).collect();
+        let largest = excess.iter().copied().fold(1.0, f64::max);
         let own = |state: usize| self.settings.channels.iter().position(|c| c.state == state);
         let states: Vec<(usize, f64)> = drift
             .states
             .iter()
             .enumerate()
             .map(|(s, sd)| {
-                // What no sensor shows is not made worse on its account.
-                let extra = own(s).map_or(*sd, |c| sd * excess[c]);
+                // A model that misses something in one place is off, if less so, in others as well: a sensor says how
+                // far. What no sensor shows is not made worse on that account.
+                let extra = own(s).map_or(*sd, |c| sd * excess[c].max(largest.sqrt()));
                 (s, extra * dt.sqrt())
             })
             .filter(|(_, sd)| *sd > 0.0)
@@ -905,9 +907,10 @@ impl<M: Model> Ensemble<M> {
         let (n, m) = (self.model.n_states(), self.members.len());
         let explainers = Explainers::new(&values[(n - self.model.n_discrepancies()) * m..n * m], m);
         let noise = |q: usize| self.settings.aleatoric_sd_mmhg.get(q).copied().unwrap_or(0.0);
+        let phase = self.cycles().map(|cycles| cycles.rem_euclid(1.0));
         let systematic = |q: usize| {
             let own = self.settings.channels.iter().position(|c| c.state == q);
-            own.map_or(0.0, |channel| self.fits[channel].systematic_sd())
+            own.map_or(0.0, |channel| self.fits[channel].systematic_sd(phase))
         };
         let summary = |(q, row): (usize, &mut [f64])| {
             let share = explainers.share_of(row);

@@ -141,7 +141,7 @@ impl BeatTracker {
             preferred,
             active: None,
             rate: RateTracker::new(),
-            acquired: source != TimingSource::Found,
+            acquired: source == TimingSource::Clock,
             waiting: false,
             last_beat_s: None,
             last_interval_s: None,
@@ -197,7 +197,9 @@ impl BeatTracker {
                 }
             }
             let onset = ear.observed.take(sample.time_s, sample.observed);
-            if let (Some(onset), Some(delay_s), true) = (onset, ear.delays_s.median(), self.active == Some(sample.channel)) {
+            if let (Some(onset), Some(delay_s), true) =
+                (onset, ear.delays_s.median(), self.active == Some(sample.channel))
+            {
                 self.rate.take(&onset);
                 self.beat(onset.time_s - delay_s, clock, false, &mut found);
             }
@@ -210,7 +212,8 @@ impl BeatTracker {
         let interval_s = self.last_beat_s.map(|last| at_s - last);
         self.last_beat_s = Some(at_s);
         if !self.acquired {
-            if let Some(interval_s) = self.rate.interval_s() {
+            let interval_s = if certain { interval_s } else { self.rate.interval_s() };
+            if let Some(interval_s) = interval_s.filter(|interval_s| *interval_s > 0.0) {
                 self.acquired = true;
                 found.acquired = true;
                 found.edits.push(ClockEdit::Beat { at_s, rate: Some(60.0 / interval_s) });
@@ -223,7 +226,11 @@ impl BeatTracker {
         if certain || self.waiting || error.abs() > SURPRISE {
             let same = |(a, b): (f64, f64)| (a / b - 1.0).abs() < SAME_RHYTHM;
             let rhythm = interval_s.zip(self.last_interval_s).filter(|pair| same(*pair));
-            let changed = rhythm.filter(|_| certain || self.surprises > 0).map(|(now, before)| 120.0 / (now + before));
+            let changed = if certain {
+                interval_s.filter(|interval_s| *interval_s > 0.0).map(|interval_s| 60.0 / interval_s)
+            } else {
+                rhythm.filter(|_| self.surprises > 0).map(|(now, before)| 120.0 / (now + before))
+            };
             found.edits.push(ClockEdit::Beat { at_s, rate: changed });
             found.surprised |= !certain;
             self.surprises += 1;
@@ -242,7 +249,9 @@ impl BeatTracker {
             }
             return;
         };
-        let (Some(delay_s), Some(last_beat_s)) = (self.ears[channel].delays_s.median(), self.last_beat_s) else { return };
+        let (Some(delay_s), Some(last_beat_s)) = (self.ears[channel].delays_s.median(), self.last_beat_s) else {
+            return;
+        };
         if !self.acquired || self.waiting || !found.edits.is_empty() {
             return;
         }

@@ -473,7 +473,9 @@ fn direct_state_bits(estimate: &Estimate) -> (i64, Vec<u64>) {
 
 fn direct_parameter_bits(estimate: &Estimate) -> Vec<u64> {
     let row = |(p, since): &(hemostream::estimate::ensemble::ParameterSummary, i64)| {
-        [p.summary.mean, p.summary.sd, p.summary.q05, p.summary.q95, p.identifiability, s_from_ns(*since)]
+        let s = &p.summary;
+        let identifiable = if p.is_identifiable() { 1.0 } else { 0.0 };
+        [s.mean, s.sd, s.q05, s.q95, p.identifiability, s_from_ns(*since), identifiable]
     };
     estimate.parameters.iter().flat_map(row).map(f64::to_bits).collect()
 }

@@ -403,7 +403,7 @@ impl Default for EstimatorSettings {
             members: 100,
             seed: 1,
             parameter_drift: 0.02,
-            pressure_drift: 0.001,
+            pressure_drift: 0.0002,
             inflation: 1.0,
             prior: BTreeMap::new(),
             adaptive: true,

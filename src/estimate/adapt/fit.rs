@@ -35,9 +35,9 @@ const AIM: f64 = 1.2;
 const GAIN_PER_S: [f64; 2] = [2.0, 0.7];
 
 /// Phases of the beat that are told apart, and the share of what they say that is kept from beat to beat: what a model
-/// misses comes back with every beat, and stands out from the noise when some twenty are laid over each other.
+/// misses comes back with every beat, and stands out from the noise when some tens of beats are laid over each other.
 const PHASES: usize = 16;
-const KEPT_PER_BEAT: f64 = 0.95;
+const KEPT_PER_BEAT: f64 = 0.98;
 
 /// Mean square of the phases above which what comes back is hardly an accident (3 % of the channels that fit).
 const SYSTEMATIC: f64 = 1.7;
@@ -52,6 +52,12 @@ struct Phase {
     sum: f64,
     weight: f64,
     square_weight: f64,
+}
+
+/// Where a phase in `[0, 1)` belongs.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+fn bin(phase: f64) -> usize {
+    ((phase * PHASES as f64) as usize).min(PHASES - 1)
 }
 
 /// Fit of one channel.
@@ -138,17 +144,20 @@ impl ChannelFit {
         self.recurrence() > MISFIT_RECURRENCE || self.log_excess > MISFIT_EXCESS.ln()
     }
 
-    /// Standard deviation of what the model misses in every beat, as far as it stands out of the noise \[mmHg\].
+    /// Standard deviation of what the model misses in every beat, as far as it stands out of the noise \[mmHg\]: over the
+    /// whole beat, or at a phase of it where that is more.
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
-    pub fn systematic_sd(&self) -> f64 {
+    pub fn systematic_sd(&self, phase: Option<f64>) -> f64 {
         if self.recurrence() < SYSTEMATIC {
             return 0.0;
         }
         // The square of a mean is larger than that of what it estimates, by the variance of the mean.
         let square = |phase: &Phase| (phase.sum * phase.sum - phase.square_weight) / (phase.weight * phase.weight);
         let known: Vec<f64> = self.phases.iter().filter(|phase| phase.weight > 0.0).map(square).collect();
-        (known.iter().sum::<f64>() / known.len() as f64 * self.variance).max(0.0).sqrt()
+        let mean = known.iter().sum::<f64>() / known.len() as f64;
+        let here = phase.map(|phase| &self.phases[bin(phase)]).filter(|phase| phase.weight > 0.0).map_or(0.0, square);
+        (mean.max(here) * self.variance).max(0.0).sqrt()
     }
 
     /// Hears of a sample: its time and phase of the beat in `[0, 1)`, residual in units of the stated noise, and the sd
@@ -183,9 +192,8 @@ impl ChannelFit {
         }
     }
 
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     fn hear_phase(&mut self, phase: f64, innovation: f64) {
-        let now = ((phase * PHASES as f64) as usize).min(PHASES - 1);
+        let now = bin(phase);
         if now < self.phase {
             for phase in &mut self.phases {
                 phase.sum *= KEPT_PER_BEAT;

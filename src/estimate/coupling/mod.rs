@@ -10,14 +10,18 @@ use crate::xtfc::problem::Unknowns;
 #[must_use]
 pub fn coupled_unknowns<M: Model>(model: &M, parameters: &[usize], transforms: &[Transform]) -> Unknowns {
     let phase = model.cycle().map(|cycle| cycle.phase);
-    // A trust region. A quarter is far beyond any sensible update; a clock that moves further than this in one step
+    // A trust region. A quarter, or most of a typical size, is far beyond any sensible update; a clock that moves further than this in one step
     // leaves the part of the beat in which its effect was linear.
-    let max_step = |p: &usize| if Some(*p) == phase { 0.02 } else { 0.25 };
+    let max_step = |(p, transform): (&usize, &Transform)| match transform {
+        _ if Some(*p) == phase => 0.02,
+        Transform::Log => 0.25,
+        Transform::Linear { .. } => std::f64::consts::LN_2,
+    };
     Unknowns {
         initial_state: true,
         parameters: parameters.to_vec(),
         transforms: transforms.to_vec(),
-        max_steps: parameters.iter().map(max_step).collect(),
+        max_steps: parameters.iter().zip(transforms).map(max_step).collect(),
     }
 }
 

@@ -53,7 +53,7 @@ fn state(bed: &str, time_ns: i64, since_data_s: f64) -> Message {
 }
 
 fn parameters(bed: &str, time_ns: i64) -> Message {
-    let values = vec![0.0812, 0.002, 0.0771, 0.0853, 0.9, 0.1, 1.61, 0.1, 1.52, 1.77, 0.9, 0.1];
+    let values = vec![0.0812, 0.002, 0.0771, 0.0853, 0.9, 0.1, 1.0, 1.61, 0.1, 1.52, 1.77, 0.9, 0.1, 1.0];
     assert_eq!(values.len(), 2 * PARAMETER_STATISTICS.len());
     let names = vec!["r_pv".to_owned(), "c_a".to_owned()];
     let estimate = ParameterEstimate { header: header(time_ns), members: 100, names, values };
