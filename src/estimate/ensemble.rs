@@ -10,13 +10,14 @@ use super::adapt::fit::ChannelFit;
 use super::adapt::pace::{Pace, diffusion};
 use super::coupling::{coupled, coupled_unknowns, independent_unknowns};
 pub use super::member::Member;
+use super::member::expectations;
 use super::random::exact_normals;
 use super::rivals::Unscented;
 use super::settings::{ChannelSettings, CouplingKind, EstimatorSettings, SettingsError};
 use super::smoother::{Correction, Remembered, Smoother};
 use super::statistics::{Explainers, Summary, mean_and_sd, summarise};
 use super::time::EventTime;
-use super::timing::{ClockEdit, WAITING_PHASE};
+use super::timing::{ClockEdit, TimingSource, WAITING_PHASE};
 use crate::model::{Cycle, Model, Transform};
 use crate::xtfc::basis::Basis;
 use crate::xtfc::features::{FeatureError, RandomFeatures};
@@ -311,11 +312,6 @@ impl<M: Model> Ensemble<M> {
         &self.fits[channel]
     }
 
-    /// How fast an estimated parameter is believed to move now, over what the settings say.
-    pub fn pace(&self, k: usize) -> f64 {
-        self.paces[k].now() / self.settings.beliefs[self.estimated[k]].drift
-    }
-
     /// Solves one window for every member; observations are in order of time, then channel.
     pub fn step(&mut self, observations: &[Observation], parallel: &dyn Parallel) -> WindowReport {
         let h = self.settings.window.length_s();
@@ -369,9 +365,12 @@ impl<M: Model> Ensemble<M> {
         let report = self.first_look(observations, h, parallel);
         self.elapsed_s += h;
         self.window += 1;
-        self.memory.note(observations);
-        if self.memory.is_due(h) {
-            self.memory.keep(self.checkpoint());
+        // Nothing else is ever looked at again.
+        if self.settings.adaptation.pace || self.settings.live.timing != TimingSource::Clock {
+            self.memory.note(observations);
+            if self.memory.is_due(h) {
+                self.memory.keep(self.checkpoint());
+            }
         }
         report
     }
@@ -637,8 +636,7 @@ impl<M: Model> Ensemble<M> {
 
     fn correct_the_past(&mut self, observations: &[Observation], sd: &[f64], noise: &[f64]) {
         let m = self.members.len();
-        let expected: Vec<f64> =
-            (0..sd.len()).flat_map(|j| self.members.iter().map(move |member| member.expected[j])).collect();
+        let expected = expectations(&self.members, sd.len());
         let off: Vec<f64> = expected
             .iter()
             .zip(noise)
@@ -810,7 +808,10 @@ impl<M: Model> Ensemble<M> {
         if report.solved > 0 {
             report.physics_rms = (squares / report.solved as f64).sqrt();
         }
-        report.innovations = self.innovations(observations);
+        // `coupled` has compared the samples with what it expected before it solved.
+        if self.settings.coupling == CouplingKind::Independent {
+            report.innovations = self.innovations(observations);
+        }
         report.replaced = self.replace_failed();
         report
     }

@@ -322,11 +322,6 @@ impl<M: Model> Estimator<M> {
         self.ensemble.as_ref().map(|ensemble| ensemble.fit(channel))
     }
 
-    /// See [`Ensemble::pace`]; None before the first window.
-    pub fn pace(&self, k: usize) -> Option<f64> {
-        self.ensemble.as_ref().map(|ensemble| ensemble.pace(k))
-    }
-
     /// What it was told.
     pub fn settings(&self) -> &EstimatorSettings {
         &self.settings

@@ -32,6 +32,11 @@ pub struct Member {
     pub(super) solved: bool,
 }
 
+/// What members expect of the samples of a window, `[n_observations x n_members]`.
+pub(super) fn expectations(members: &[Member], observations: usize) -> Vec<f64> {
+    (0..observations).flat_map(|j| members.iter().map(move |member| member.expected[j])).collect()
+}
+
 impl Member {
     pub(super) fn new(basis: Option<Basis>, x: Vec<f64>, theta: Vec<f64>) -> Self {
         let solution = Solution {

@@ -4,11 +4,11 @@
 
 use rand::Rng;
 
-use super::coupling::coupled::semidefinite_cholesky;
+use super::coupling::coupled::{covariance, gain, semidefinite_cholesky};
 use super::ensemble::{Ensemble, Observation, Parallel, WindowReport};
-use super::member::Member;
+use super::member::{Member, expectations};
 use super::random::exact_normals;
-use super::statistics::{centred, mean_and_sd};
+use super::statistics::mean_and_sd;
 use crate::model::Model;
 
 /// Unscented Kalman filter over (state, parameter coordinates): mean, covariance, and a standard normal cloud that
@@ -34,37 +34,6 @@ impl Unscented {
     }
 }
 
-/// `[n_a x n_b]` of rows over the members.
-#[allow(clippy::cast_precision_loss)]
-fn covariance(a: &[f64], b: &[f64], members: usize) -> Vec<f64> {
-    let (a, b): (Vec<_>, Vec<_>) =
-        (a.chunks_exact(members).map(centred).collect(), b.chunks_exact(members).map(centred).collect());
-    let degrees = members as f64 - 1.0;
-    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / degrees;
-    a.iter().flat_map(|a| b.iter().map(|b| product(a, b)).collect::<Vec<_>>()).collect()
-}
-
-/// `cross S^-1`, `[n x m]`; None if `S` is not definite.
-fn gain(cross: &[f64], innovation: &[f64], m: usize) -> Option<Vec<f64>> {
-    let mut factor = innovation.to_vec();
-    semidefinite_cholesky(&mut factor, m);
-    if (0..m).any(|i| factor[i * m + i] <= 0.0) {
-        return None;
-    }
-    let mut gain = cross.to_vec();
-    for row in gain.chunks_exact_mut(m) {
-        for i in 0..m {
-            let known: f64 = (0..i).map(|k| factor[i * m + k] * row[k]).sum();
-            row[i] = (row[i] - known) / factor[i * m + i];
-        }
-        for i in (0..m).rev() {
-            let known: f64 = (i + 1..m).map(|k| factor[k * m + i] * row[k]).sum();
-            row[i] = (row[i] - known) / factor[i * m + i];
-        }
-    }
-    Some(gain)
-}
-
 impl<M: Model> Ensemble<M> {
     /// Forecast, then the stochastic update with perturbed observations.
     pub(super) fn enkf_step(&mut self, observations: &[Observation], h: f64, parallel: &dyn Parallel) -> WindowReport {
@@ -82,8 +51,7 @@ impl<M: Model> Ensemble<M> {
         }
         let members = self.len();
         let (rows, sd) = (self.rows(), self.stated_noise(observations));
-        let expected: Vec<f64> =
-            (0..sd.len()).flat_map(|j| self.members.iter().map(move |member| member.expected[j])).collect();
+        let expected = expectations(&self.members, sd.len());
         let noise = exact_normals(sd.len(), members, &rows, &mut self.rng);
         let m = sd.len();
         let mut innovation = covariance(&expected, &expected, members);
@@ -120,10 +88,7 @@ impl<M: Model> Ensemble<M> {
 
         let points = self.sigma_points(&mut filter, observations, h);
         let m = observations.len();
-        let (ends, expected): (Vec<f64>, Vec<f64>) = {
-            let rows = self.rows_of(&filter.points);
-            (rows, (0..m).flat_map(|j| filter.points.iter().map(move |p| p.expected[j])).collect())
-        };
+        let (ends, expected) = (self.rows_of(&filter.points), expectations(&filter.points, m));
         let moments = |a: &[f64], b: &[f64]| weighted_covariance(a, b, points);
         filter.mean = ends.chunks_exact(points).map(weighted_mean).collect();
         filter.covariance = moments(&ends, &ends);

@@ -6,7 +6,7 @@
 
 use std::collections::VecDeque;
 
-use super::coupling::coupled::semidefinite_cholesky;
+use super::coupling::coupled::{covariance, gain};
 use super::statistics::centred;
 use super::time::EventTime;
 
@@ -44,39 +44,14 @@ impl Correction {
     /// From what members expected and how far off the perturbed samples are, both `[n_observations x n_members]`, and the
     /// noise of each. None if the samples cannot be told apart.
     #[must_use]
-    #[allow(clippy::cast_precision_loss)]
     pub fn new(expected: &[f64], off: &[f64], sd: &[f64], members: usize) -> Option<Self> {
         let m = sd.len();
-        let expected: Vec<f64> = expected.chunks_exact(members).flat_map(centred).collect();
-        let row = |j: usize| &expected[j * members..(j + 1) * members];
-        let mut s = vec![0.0; m * m];
-        for i in 0..m {
-            for j in 0..=i {
-                let product: f64 = row(i).iter().zip(row(j)).map(|(a, b)| a * b).sum();
-                s[i * m + j] = product / (members as f64 - 1.0) + if i == j { sd[i] * sd[i] } else { 0.0 };
-            }
-        }
-        semidefinite_cholesky(&mut s, m);
-        if (0..m).any(|i| s[i * m + i] <= 0.0) {
-            return None;
-        }
-        let mut weights = off.to_vec();
-        for i in 0..m {
-            for k in 0..i {
-                let (done, rest) = weights.split_at_mut(i * members);
-                let known = &done[k * members..(k + 1) * members];
-                rest[..members].iter_mut().zip(known).for_each(|(w, v)| *w -= s[i * m + k] * v);
-            }
-            weights[i * members..(i + 1) * members].iter_mut().for_each(|w| *w /= s[i * m + i]);
-        }
-        for i in (0..m).rev() {
-            for k in i + 1..m {
-                let (rest, done) = weights.split_at_mut(k * members);
-                let own = &mut rest[i * members..(i + 1) * members];
-                own.iter_mut().zip(&done[..members]).for_each(|(w, v)| *w -= s[k * m + i] * v);
-            }
-            weights[i * members..(i + 1) * members].iter_mut().for_each(|w| *w /= s[i * m + i]);
-        }
+        let mut innovation = covariance(expected, expected, members);
+        (0..m).for_each(|j| innovation[j * m + j] += sd[j] * sd[j]);
+        let of_members: Vec<f64> = (0..members).flat_map(|i| (0..m).map(move |j| off[j * members + i])).collect();
+        let solved = gain(&of_members, &innovation, m)?;
+        let weights = (0..m).flat_map(|j| solved.iter().skip(j).step_by(m).copied()).collect();
+        let expected = expected.chunks_exact(members).flat_map(centred).collect();
         Some(Self { members, expected, weights })
     }
 

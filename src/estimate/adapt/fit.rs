@@ -16,9 +16,6 @@ const NEIGHBOURS_S: f64 = 0.1;
 /// Memory of the noise, in samples; as many samples' worth of belief in the setting at the start.
 const NOISE_MEMORY: f64 = 1000.0;
 
-/// Memory of the mean square that is published, per sample.
-const PUBLISHED_MEMORY: f64 = 0.005;
-
 /// Memory of the mean squares of blocks \[s\]: some tens of blocks each.
 const MEMORY_S: [f64; 2] = [4.0, 10.0];
 
@@ -71,8 +68,6 @@ pub struct ChannelFit {
     last: Option<(f64, f64)>,
     /// Blocks: start, sum of normalised innovations, their number.
     blocks: [(f64, f64, usize); 2],
-    /// Mean square of normalised innovations, lately.
-    square: Option<f64>,
     /// Mean square of blocks of each length, lately.
     whiteness: [f64; 2],
     phases: [Phase; PHASES],
@@ -94,7 +89,6 @@ impl ChannelFit {
             noise_square: 1.0,
             last: None,
             blocks: [(f64::NEG_INFINITY, 0.0, 0); 2],
-            square: None,
             whiteness: [1.0; 2],
             phases: [Phase::default(); PHASES],
             phase: 0,
@@ -114,12 +108,6 @@ impl ChannelFit {
     #[must_use]
     pub fn excess(&self) -> f64 {
         self.log_excess.exp()
-    }
-
-    /// Root mean square of the normalised innovations, lately; NaN before any.
-    #[must_use]
-    pub fn innovation_rms(&self) -> f64 {
-        self.square.map_or(f64::NAN, f64::sqrt)
     }
 
     /// Mean square of sums of neighbouring normalised innovations, lately: 1 when they are white.
@@ -170,8 +158,6 @@ impl ChannelFit {
         if let Some(phase) = phase {
             self.hear_phase(phase, innovation.clamp(-3.0, 3.0));
         }
-        let mean = self.square.get_or_insert(innovation * innovation);
-        *mean += PUBLISHED_MEMORY * (innovation * innovation - *mean);
         if let Some((before, _)) = self.last.filter(|(_, at)| time_s - at <= NEIGHBOURS_S && time_s > *at) {
             let square = 0.5 * (residual - before) * (residual - before);
             // Spikes are not noise.

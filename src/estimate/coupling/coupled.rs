@@ -13,20 +13,42 @@ const SINGULAR: f64 = 1e-12;
 ///
 /// `root` is `[n x n]`, row-major, lower triangular. A singular covariance (fewer members than unknowns, something
 /// known exactly) leaves zero columns: directions without spread do not move.
-#[allow(clippy::cast_precision_loss)]
 pub fn covariance_root(rows: &[f64], members: usize, root: &mut Vec<f64>) {
-    let deviations: Vec<Vec<f64>> = rows.chunks_exact(members).map(centred).collect();
-    let n = deviations.len();
-    root.clear();
-    root.resize(n * n, 0.0);
-    let degrees = (members as f64 - 1.0).max(1.0);
-    for i in 0..n {
-        for j in 0..=i {
-            let product: f64 = deviations[i].iter().zip(&deviations[j]).map(|(a, b)| a * b).sum();
-            root[i * n + j] = product / degrees;
+    *root = covariance(rows, rows, members);
+    let n = rows.len() / members;
+    semidefinite_cholesky(root, n);
+    (0..n).for_each(|i| root[i * n + i + 1..(i + 1) * n].fill(0.0));
+}
+
+/// Sample covariance of two sets of rows over the members, `[n_a x n_b]`.
+#[allow(clippy::cast_precision_loss)]
+pub(crate) fn covariance(a: &[f64], b: &[f64], members: usize) -> Vec<f64> {
+    let (a, b): (Vec<_>, Vec<_>) =
+        (a.chunks_exact(members).map(centred).collect(), b.chunks_exact(members).map(centred).collect());
+    let degrees = members as f64 - 1.0;
+    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / degrees;
+    a.iter().flat_map(|a| b.iter().map(|b| product(a, b)).collect::<Vec<_>>()).collect()
+}
+
+/// `cross S^-1` for symmetric `S` `[m x m]`, `[n x m]`; None if `S` is not definite.
+pub(crate) fn gain(cross: &[f64], innovation: &[f64], m: usize) -> Option<Vec<f64>> {
+    let mut factor = innovation.to_vec();
+    semidefinite_cholesky(&mut factor, m);
+    if (0..m).any(|i| factor[i * m + i] <= 0.0) {
+        return None;
+    }
+    let mut gain = cross.to_vec();
+    for row in gain.chunks_exact_mut(m) {
+        for i in 0..m {
+            let known: f64 = (0..i).map(|k| factor[i * m + k] * row[k]).sum();
+            row[i] = (row[i] - known) / factor[i * m + i];
+        }
+        for i in (0..m).rev() {
+            let known: f64 = (i + 1..m).map(|k| factor[k * m + i] * row[k]).sum();
+            row[i] = (row[i] - known) / factor[i * m + i];
         }
     }
-    semidefinite_cholesky(root, n);
+    Some(gain)
 }
 
 /// Cholesky in place on the lower triangle; columns without variance become zero.
