@@ -6,6 +6,7 @@ use ratatui::buffer::Buffer;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
 
+use super::panels::beat_reading;
 use super::paper::{panel, put};
 use super::style;
 use super::traces::reading;
@@ -36,8 +37,8 @@ pub(super) fn draw(buf: &mut Buffer, area: Rect, ward: &Ward, ui: &Ui, now: Dura
 
 fn heading() -> String {
     format!(
-        "{:<NAME_WIDTH$}  {:<STATE_WIDTH$}{:>4}  {:<14} {:<14} {:>8} {:>8}  {}",
-        "bed", "state", "HR", "p_a mmHg", "p_pv mmHg", "members", "p99 ms", "last event"
+        "{:<NAME_WIDTH$}  {:<STATE_WIDTH$}{:>4}  {:<14} {:<14} {:<14} {:>8} {:>8}  {}",
+        "bed", "state", "HR", "p_a mmHg", "p_pv mmHg", "CO L/min", "members", "p99 ms", "last event"
     )
 }
 
@@ -51,6 +52,8 @@ fn summary(name: &str, bed: &Bed, now: Duration, is_chosen: bool) -> Vec<Span<'s
         })
     };
     let heart_rate = bed.heart_rate_bpm().map_or(style::NONE.to_owned(), |v| style::number(v, 0));
+    let output = bed.of_beat("cardiac_output").map(beat_reading);
+    let output = output.map_or(style::NONE.to_owned(), |(mean, half)| format!("{mean} {half}"));
     let status = bed.status.as_ref();
     let members = status.map_or(style::NONE.to_owned(), |s| format!("{}/{}", s.members_alive, s.members));
     let lag = status.map_or(style::NONE.to_owned(), |s| style::number(s.lag_p99_ms, 2));
@@ -62,7 +65,7 @@ fn summary(name: &str, bed: &Bed, now: Duration, is_chosen: bool) -> Vec<Span<'s
         Span::styled(state.clone(), look),
         Span::raw(" ".repeat(STATE_WIDTH.saturating_sub(state.chars().count()))),
         Span::styled(format!(" {heart_rate:>4}  "), style::STRONG),
-        Span::styled(format!("{:<14} {:<14} ", pressure("p_a"), pressure("p_pv")), style::PLAIN),
+        Span::styled(format!("{:<14} {:<14} {output:<14} ", pressure("p_a"), pressure("p_pv")), style::PLAIN),
         Span::styled(format!("{members:>8} {lag:>8}  "), style::QUIET),
         Span::styled(event, style::PLAIN),
     ]

@@ -32,7 +32,8 @@ use crate::edge::bus::{Bus, BusError, Handler, Message, Subscription};
 use crate::runtime::clock::Clock;
 
 /// What is shown, under `PREFIX/BED/`.
-const TOPICS: [&str; 6] = ["pressure/*", "estimate/state", "estimate/parameters", "truth", "status", "event"];
+const TOPICS: [&str; 7] =
+    ["pressure/*", "estimate/state", "estimate/parameters", "estimate/beat", "truth", "status", "event"];
 /// Messages between the bus and the screen; more are dropped and counted.
 const QUEUE: usize = 16_384;
 /// Time between two pictures.
@@ -176,7 +177,9 @@ mod feed_tests {
         let (bus, dropped) = (MemoryBus::new(), Arc::new(AtomicU64::new(0)));
         let (sender, receiver) = sync_channel(2);
         let subscriptions = subscribe(&bus, "some/ward", &sender, &dropped).unwrap();
-        for wanted in ["estimate/state", "estimate/parameters", "truth", "status", "event", "pressure/p_a"] {
+        for wanted in
+            ["estimate/state", "estimate/parameters", "estimate/beat", "truth", "status", "event", "pressure/p_a"]
+        {
             assert!(bus.is_wanted(&format!("some/ward/bed1/{wanted}")), "{wanted}");
         }
         for unwanted in ["estimate/state/json", "estimate/members", "status/json"] {

@@ -10,7 +10,7 @@ use super::paper::{DOTS_X, DOTS_Y, Ink, Raster, panel, put, put_right};
 use super::style::{self, count};
 use super::traces::reading;
 use super::ui::{Group, Ui};
-use super::ward::{Band, Bed, Parameter, Ward, quantity_names, seconds};
+use super::ward::{Band, BeatReading, Bed, Parameter, Ward, quantity_names, seconds};
 use crate::edge::wire::{ChannelStatus, Status};
 
 /// Below this the gauge of a band says nothing.
@@ -27,6 +27,9 @@ const MISFIT: f64 = 1.5;
 const UNINFORMED_AFTER_S: f64 = 5.0;
 /// Status is sent once a second; older than this, it is marked.
 const STATUS_OVERDUE: Duration = Duration::from_secs(3);
+
+/// Events that say that all is well, or well again.
+const GOOD_EVENTS: [&str; 5] = ["start", "recovered", "artefact_over", "model_fits", "beat_found"];
 
 /// How far back the axis of a gauge looks \[ns\].
 const GAUGE_LOOK_BACK_NS: i64 = 30_000_000_000;
@@ -47,7 +50,8 @@ impl ParameterText {
         let comma = if is_short { "," } else { ", " };
         Self {
             name: parameter.name.clone(),
-            mean: number(mean),
+            // Grey alone would not do for everyone.
+            mean: number(mean) + if parameter.is_identifiable { "" } else { "?" },
             band: format!("[{}{comma}{}]", number(low), number(high)),
             truth: truth.map(|v| format!("◆{}", number(v))).unwrap_or_default(),
         }
@@ -128,10 +132,11 @@ fn draw_parameter(
     columns: Columns,
 ) {
     let Columns { name, mean, band, truth: true_value } = columns;
+    let grey = |look| if parameter.is_identifiable { look } else { style::PAST };
     let mut spans = vec![
-        Span::styled(format!("{:<name$} ", text.name), style::INFERRED),
-        Span::styled(format!("{:>mean$} ", text.mean), style::STRONG),
-        Span::styled(format!("{:>band$} ", text.band), style::PLAIN),
+        Span::styled(format!("{:<name$} ", text.name), grey(style::INFERRED)),
+        Span::styled(format!("{:>mean$} ", text.mean), grey(style::STRONG)),
+        Span::styled(format!("{:>band$} ", text.band), grey(style::PLAIN)),
     ];
     let is_truth_inline = columns.with_truth() <= usize::from(area.width);
     if is_truth_inline {
@@ -161,7 +166,9 @@ fn draw_parameter(
 
 fn draw_unit_and_gauge(buf: &mut Buffer, area: Rect, parameter: &Parameter, truth: Option<f64>) {
     let is_uninformed = parameter.since_informed_s > UNINFORMED_AFTER_S;
-    let text = if is_uninformed {
+    let text = if !parameter.is_identifiable {
+        Span::styled("not identifiable ", style::QUIET)
+    } else if is_uninformed {
         Span::styled(format!("uninformed {} ", style::duration(parameter.since_informed_s)), style::WARNING)
     } else {
         // As wide as the widest unit, so that the gauges stand in line.
@@ -211,8 +218,10 @@ fn draw_gauge(buf: &mut Buffer, area: Rect, parameter: &Parameter, truth: Option
         let is_within = (cell(parameter.low)..=cell(parameter.high)).contains(&f64::from(column));
         let (symbol, look) = match () {
             () if truth.is_some_and(|v| at(v, column)) => ("◆", style::TRUTH),
-            () if at(parameter.mean, column) => ("●", style::STRONG),
-            () if is_within => ("━", style::INFERRED),
+            () if at(parameter.mean, column) => {
+                ("●", if parameter.is_identifiable { style::STRONG } else { style::PAST })
+            }
+            () if is_within => ("━", if parameter.is_identifiable { style::INFERRED } else { style::PAST }),
             () => ("·", style::RULE),
         };
         put(buf, Rect { x: area.x + column, width: 1, ..area }, 0, Span::styled(symbol, look));
@@ -239,6 +248,46 @@ fn draw_trend(buf: &mut Buffer, area: Rect, parameter: &Parameter) {
         drawn = drawn.max(x);
     }
     raster.paint(buf, area, |ink| if ink == Ink::Mean { style::INFERRED } else { style::RULE });
+}
+
+/// What a beat is told by, with the names that bedsides know.
+const BEAT: [(&str, &str); 6] = [
+    ("cardiac_output", "CO"),
+    ("stroke_volume", "SV"),
+    ("ejection_fraction", "EF"),
+    ("heart_rate", "HR"),
+    ("svr", "SVR"),
+    ("pvr", "PVR"),
+];
+/// Rows of [`draw_beat`].
+pub(super) const BEAT_ROWS: u16 = 4;
+
+/// The last beat in two columns of numbers.
+pub(super) fn draw_beat(buf: &mut Buffer, area: Rect, bed: &Bed) {
+    const WIDTH_WITH_UNITS: u16 = 29;
+    let inner = panel(buf, area, vec![Span::styled("last beat", style::STRONG), Span::styled(" mean ±", style::QUIET)]);
+    let width = inner.width / 2;
+    for (i, (name, label)) in (0..).zip(BEAT) {
+        let Some(reading) = bed.of_beat(name) else { continue };
+        let (mean, half) = beat_reading(reading);
+        let mut spans = vec![
+            Span::styled(format!("{label:<4}"), style::INFERRED),
+            Span::styled(format!("{mean:>6}"), style::STRONG),
+            Span::styled(format!(" {half:<6}"), style::QUIET),
+        ];
+        if width >= WIDTH_WITH_UNITS {
+            spans.push(Span::styled(format!(" {}", reading.unit), style::QUIET));
+        }
+        let half = Rect { x: inner.x + (i % 2) * width, width, ..inner };
+        put(buf, half, i / 2, Line::from(spans));
+    }
+}
+
+/// Mean, and half the width of the band.
+pub(super) fn beat_reading(reading: &BeatReading) -> (String, String) {
+    let (mean, half) = (f64::from(reading.band.mean), 0.5 * f64::from(reading.band.high - reading.band.low));
+    let digits = style::decimals(mean, half);
+    (style::number(mean, digits), format!("±{}", style::number(half, digits)))
 }
 
 /// Rows of [`draw_values`].
@@ -342,9 +391,11 @@ fn solver_health(status: &Status) -> Vec<Line<'static>> {
 }
 
 fn channel_health(channel: &ChannelStatus, status: &Status) -> Line<'static> {
-    let is_live = channel.state == "live";
+    let is_set_aside = !channel.artefact.is_empty();
+    let is_used = channel.state == "live" && !is_set_aside;
     let silence_s = seconds(status.header.time_ns.saturating_sub(channel.last_sample_ns));
     let state = match channel.state.as_str() {
+        "live" if is_set_aside => channel.artefact.clone(),
         "silent" if silence_s < 10.0 => format!("silent {silence_s:.0} s"),
         "silent" => format!("silent {}", style::duration(silence_s)),
         other => other.to_owned(),
@@ -352,9 +403,12 @@ fn channel_health(channel: &ChannelStatus, status: &Status) -> Line<'static> {
     let rms = channel.innovation_rms;
     let mut spans = vec![
         Span::styled(format!("{:<5}", channel.name), style::OBSERVED),
-        Span::styled(format!("{state:<11} "), if is_live { style::PLAIN } else { style::WARNING }),
+        Span::styled(format!("{state:<11} "), if is_used { style::PLAIN } else { style::WARNING }),
     ];
-    let fit = Facts::default().add("rms", style::number(rms, 2), rms > MISFIT);
+    let mut fit = Facts::default().add("rms", style::number(rms, 2), rms > MISFIT);
+    if channel.misfit {
+        fit.0.push(Span::styled(" misfit!", style::WARNING));
+    }
     spans.extend(fit.add("n", count(channel.samples_used), false).0);
     Line::from(spans)
 }
@@ -393,7 +447,7 @@ pub(super) fn draw_events(buf: &mut Buffer, area: Rect, bed: &Bed) {
     }
     let first = bed.events.len().saturating_sub(usize::from(inner.height));
     for (row, event) in (0..).zip(bed.events.range(first..)) {
-        let is_good = matches!(event.kind.as_str(), "start" | "recovered");
+        let is_good = GOOD_EVENTS.contains(&event.kind.as_str());
         let spans = vec![
             Span::styled(format!("{:>9}  ", super::style::event_time(event.time_ns)), style::QUIET),
             Span::styled(event.kind.clone(), if is_good { style::OBSERVED } else { style::WARNING }),

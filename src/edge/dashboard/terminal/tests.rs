@@ -11,7 +11,7 @@ use super::view;
 use super::ward::{Liveness, MAX_BEDS, Origin, Ward};
 use crate::edge::bus::{Encoding, Message};
 use crate::edge::wire::{
-    self, ChannelStatus, Event, Header, PARAMETER_STATISTICS, ParameterEstimate, PressureBlock, SCHEMA,
+    self, BeatEstimate, ChannelStatus, Event, Header, PARAMETER_STATISTICS, ParameterEstimate, PressureBlock, SCHEMA,
     STATE_STATISTICS, StateEstimate, Status, Truth,
 };
 use crate::model::cvsim6::{FlowsAndVolumes, Pressures};
@@ -58,6 +58,18 @@ fn parameters(bed: &str, time_ns: i64) -> Message {
     let names = vec!["r_pv".to_owned(), "c_a".to_owned()];
     let estimate = ParameterEstimate { header: header(time_ns), members: 100, names, values };
     message(&format!("ward/{bed}/estimate/parameters"), &estimate)
+}
+
+fn beat(bed: &str, time_ns: i64) -> Message {
+    let estimate = BeatEstimate {
+        header: header(time_ns),
+        members: 100,
+        end_ns: time_ns + 800 * MS,
+        names: vec!["cardiac_output".to_owned(), "pvr".to_owned(), "unheard_of".to_owned()],
+        units: vec!["L/min".to_owned(), "mmHg s/mL".to_owned(), String::new()],
+        values: vec![5.12, 0.06, 5.0, 5.24, 0.081, 0.002, 0.077, 0.085, 1.0, 0.0, 1.0, 1.0],
+    };
+    message(&format!("ward/{bed}/estimate/beat"), &estimate)
 }
 
 fn truth(bed: &str, time_ns: i64) -> Message {
@@ -128,6 +140,7 @@ fn fill(ward: &mut Ward, bed: &str) {
         }
         if i % 50 == 0 {
             ward.apply(&parameters(bed, t), now);
+            ward.apply(&beat(bed, t), now);
             ward.apply(&status(bed, t), now);
         }
     }
@@ -180,6 +193,49 @@ fn names_numbers_truth_health_events_and_keys_are_on_the_screen() {
         assert!(!screen.contains("STALE"), "{screen}");
     }
     assert_shows(&screen(&ward, &ui, 10 * SECOND, (120, 40)), &["late 42"]);
+}
+
+#[test]
+fn the_last_beat_is_on_the_screen_and_cardiac_output_in_the_header_and_the_list() {
+    let (ward, mut ui) = (filled(), Ui::new(None));
+    for size in SIZES {
+        assert_shows(screen(&ward, &ui, 10 * SECOND, size).lines().next().unwrap(), &["CO 5.12±0.12"]);
+    }
+    assert_shows(&screen(&ward, &ui, 10 * SECOND, (200, 60)), &["last beat", "CO    5.12 ±0.12", "PVR 0.0810 ±0.0040"]);
+    press(&mut ui, &ward, KeyCode::Char('b'));
+    assert_shows(&screen(&ward, &ui, 10 * SECOND, (120, 40)), &["CO L/min", "5.12 ±0.12"]);
+}
+
+#[test]
+fn what_the_data_do_not_say_is_grey_and_marked() {
+    let mut ward = Ward::new("ward");
+    ward.apply(&state("bed1", 0, 0.0), SECOND);
+    let mut estimate: ParameterEstimate = wire::decode(&parameters("bed1", 0).payload, Encoding::Bincode).unwrap();
+    *estimate.values.last_mut().unwrap() = 0.0;
+    ward.apply(&message("ward/bed1/estimate/parameters", &estimate), SECOND);
+    for size in SIZES {
+        let shown = screen(&ward, &Ui::new(None), SECOND, size);
+        assert_shows(&shown, &["1.61?"]);
+        assert!(shown.contains("0812 ") && !shown.contains("0812?"), "{shown}");
+    }
+    assert_shows(&screen(&ward, &Ui::new(None), SECOND, (120, 40)), &["not identifiable"]);
+}
+
+#[test]
+fn a_channel_that_is_set_aside_and_one_that_the_model_does_not_fit_are_marked() {
+    let mut ward = filled();
+    let mut health: Status = wire::decode(&status("bed1", 9500 * MS).payload, Encoding::Bincode).unwrap();
+    health.channels[0].artefact = "flush".to_owned();
+    ward.apply(&message("ward/bed1/status", &health), 10 * SECOND);
+    for size in SIZES {
+        let shown = screen(&ward, &Ui::new(None), 10 * SECOND, size);
+        assert_shows(&shown, &["flush"]);
+        assert!(!shown.contains("misfit!"), "{shown}");
+    }
+    health.channels[0].artefact.clear();
+    health.channels[0].misfit = true;
+    ward.apply(&message("ward/bed1/status", &health), 10 * SECOND);
+    assert_shows(&screen(&ward, &Ui::new(None), 10 * SECOND, (120, 40)), &["p_a  live", "misfit!"]);
 }
 
 #[test]
@@ -241,22 +297,22 @@ fn an_event_that_arrives_twice_is_shown_once() {
 #[test]
 fn garbage_is_counted_and_makes_no_bed() {
     let mut ward = Ward::new("ward");
-    let topics = ["estimate/state", "estimate/parameters", "status", "event", "truth", "pressure/p_a"];
+    let topics = ["estimate/state", "estimate/parameters", "estimate/beat", "status", "event", "truth", "pressure/p_a"];
     for topic in topics {
         for payload in [vec![], vec![1], vec![1, 0, 255], vec![0xff; 300], vec![9, 0, 0, 0]] {
             let key = format!("ward/noise/{topic}");
             ward.apply(&Message { key, encoding: Encoding::Bincode, payload }, SECOND);
         }
     }
-    assert_eq!((ward.unreadable, ward.beds.len()), (30, 0));
-    assert_shows(&screen(&ward, &Ui::new(None), SECOND, (80, 24)), &["30 messages, 30 of them unreadable", "WAITING"]);
+    assert_eq!((ward.unreadable, ward.beds.len()), (35, 0));
+    assert_shows(&screen(&ward, &Ui::new(None), SECOND, (80, 24)), &["35 messages, 35 of them unreadable", "WAITING"]);
 
     let elsewhere =
         ["ward", "ward/bed1", "wardrobe/bed1/status", "ward/bed1/estimate/state/json", "ward/b/pressure/ICP"];
     for key in elsewhere {
         ward.apply(&Message { key: key.to_owned(), encoding: Encoding::Json, payload: vec![1] }, SECOND);
     }
-    assert_eq!((ward.messages, ward.beds.len()), (30, 0));
+    assert_eq!((ward.messages, ward.beds.len()), (35, 0));
 }
 
 #[test]

@@ -91,6 +91,14 @@ fn draw_header(buf: &mut Buffer, area: Rect, ward: &Ward, ui: &Ui, now: Duration
         Span::styled(heart_rate, style::STRONG),
         Span::styled("/min", style::QUIET),
     ]);
+    if let Some(output) = bed.of_beat("cardiac_output").filter(|_| area.width >= WIDTH_WITH_PANELS) {
+        let (mean, half) = panels::beat_reading(output);
+        spans.extend([
+            Span::styled("  CO ", style::QUIET),
+            Span::styled(mean, style::STRONG),
+            Span::styled(half, style::QUIET),
+        ]);
+    }
     put(buf, area, 0, Line::from(spans));
     let age = bed.age(at);
     let is_late = age.is_some_and(|age| age > LATE);
@@ -193,7 +201,9 @@ fn draw_panels(buf: &mut Buffer, area: Rect, (bed, at): (&Bed, Duration), ward: 
     let one_each = panels::parameter_rows(bed, 1).min(area.height.saturating_sub(LEAST_HEALTH));
     let rest = area.height - one_each;
     let values = if rest >= panels::VALUE_ROWS + LEAST_HEALTH { panels::VALUE_ROWS } else { 0 };
-    let spare = rest.saturating_sub(values + health_rows);
+    let has_room = rest >= values + panels::BEAT_ROWS + health_rows;
+    let beat = if has_room && !bed.beat.is_empty() { panels::BEAT_ROWS } else { 0 };
+    let spare = rest.saturating_sub(beat + values + health_rows);
     let fits = |rows: &u16| panels::parameter_rows(bed, *rows) <= one_each + spare;
     let rows_each = MORE_ROWS_PER_PARAMETER.into_iter().find(fits).unwrap_or(1);
     let parameters = if rows_each > 1 { panels::parameter_rows(bed, rows_each) } else { one_each };
@@ -205,11 +215,14 @@ fn draw_panels(buf: &mut Buffer, area: Rect, (bed, at): (&Bed, Duration), ward: 
         part
     };
     panels::draw_parameters(buf, next(parameters), bed, rows_each);
+    if beat > 0 {
+        panels::draw_beat(buf, next(beat), bed);
+    }
     if values > 0 {
         panels::draw_values(buf, next(values), bed, ui.group);
     }
     if !bed.liveness(at).is_live() {
-        buf.set_style(Rect { height: parameters + values, ..area }.intersection(area), style::PAST);
+        buf.set_style(Rect { height: parameters + beat + values, ..area }.intersection(area), style::PAST);
     }
-    panels::draw_health(buf, next(area.height.saturating_sub(parameters + values)), health);
+    panels::draw_health(buf, next(area.height.saturating_sub(parameters + beat + values)), health);
 }

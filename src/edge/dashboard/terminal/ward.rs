@@ -9,8 +9,8 @@ use std::time::Duration;
 use super::history::{History, Limits};
 use crate::edge::bus::{Encoding, Message};
 use crate::edge::wire::{
-    self, ChannelStatus, Event, Header, PARAMETER_STATISTICS, ParameterEstimate, PressureBlock, STATE_STATISTICS,
-    StateEstimate, Status, Truth,
+    self, BEAT_STATISTICS, BeatEstimate, ChannelStatus, Event, Header, PARAMETER_STATISTICS, ParameterEstimate,
+    PressureBlock, STATE_STATISTICS, StateEstimate, Status, Truth,
 };
 use crate::model::cvsim6::{FlowsAndVolumes, PARAMETERS, Pressures};
 
@@ -69,7 +69,17 @@ pub(super) struct Parameter {
     pub(super) high: f64,
     /// Seconds since the data last said something about it.
     pub(super) since_informed_s: f64,
+    /// Whether data rather than settings say what it is.
+    pub(super) is_identifiable: bool,
     pub(super) trend: History<Band>,
+}
+
+/// A clinical quantity of a heart beat.
+#[derive(Debug, Clone)]
+pub(super) struct BeatReading {
+    pub(super) name: String,
+    pub(super) unit: String,
+    pub(super) band: Band,
 }
 
 /// A line of the event log.
@@ -127,6 +137,8 @@ pub(super) struct Bed {
     pub(super) truth: History<[f32; QUANTITIES]>,
     pub(super) true_parameters: BTreeMap<&'static str, f64>,
     pub(super) parameters: Vec<Parameter>,
+    /// Of the last beat that was over.
+    pub(super) beat: Vec<BeatReading>,
     pub(super) status: Option<Status>,
     pub(super) events: VecDeque<EventLine>,
     estimate_arrival: Option<Duration>,
@@ -151,6 +163,7 @@ pub(super) struct Ward {
 enum Content {
     State(StateEstimate),
     Parameters(ParameterEstimate),
+    Beat(BeatEstimate),
     Status(Status),
     Event(Event),
     Truth(Truth),
@@ -202,6 +215,7 @@ impl Content {
         let read = match topic {
             "estimate/state" => wire::decode(payload, *encoding).map(Self::State),
             "estimate/parameters" => wire::decode(payload, *encoding).map(Self::Parameters),
+            "estimate/beat" => wire::decode(payload, *encoding).map(Self::Beat),
             "status" => wire::decode(payload, *encoding).map(Self::Status),
             "event" => wire::decode(payload, *encoding).map(Self::Event),
             "truth" => wire::decode(payload, *encoding).map(Self::Truth),
@@ -219,6 +233,9 @@ impl Content {
                 cells == Some(s.values.len()) && s.since_data_s.len() == s.times_ns.len() && !s.names.is_empty()
             }
             Self::Parameters(p) => product(p.names.len(), PARAMETER_STATISTICS.len()) == Some(p.values.len()),
+            Self::Beat(b) => {
+                product(b.names.len(), BEAT_STATISTICS.len()) == Some(b.values.len()) && b.units.len() == b.names.len()
+            }
             Self::Truth(t) => t.names.len() == t.values.len(),
             Self::Samples(_, b) => b.offsets_ns.is_empty() || b.offsets_ns.len() == b.values.len(),
             Self::Status(_) | Self::Event(_) => true,
@@ -293,6 +310,7 @@ impl Bed {
                 self.take_samples(channel, &block, limits);
             }
             Content::Parameters(parameters) => self.take_parameters(&parameters),
+            Content::Beat(beat) => self.take_beat(&beat),
             Content::Truth(truth) => self.take_truth(&truth, limits),
             Content::Status(status) => {
                 self.status_arrival = arrival.or(self.status_arrival);
@@ -343,6 +361,21 @@ impl Bed {
             });
             self.parameters[at].update(estimate.header.time_ns, row);
         }
+    }
+
+    fn take_beat(&mut self, beat: &BeatEstimate) {
+        let rows = beat.names.iter().zip(&beat.units).zip(beat.values.chunks(BEAT_STATISTICS.len()));
+        let reading = |((name, unit), row): ((&String, &String), &[f64])| BeatReading {
+            name: tame(name, MAX_NAME),
+            unit: tame(unit, MAX_NAME),
+            band: Band::from_row(&BEAT_STATISTICS, row),
+        };
+        self.beat = rows.take(MAX_PARAMETERS).map(reading).collect();
+    }
+
+    /// A clinical quantity of the last beat.
+    pub(super) fn of_beat(&self, name: &str) -> Option<&BeatReading> {
+        self.beat.iter().find(|reading| reading.name == name)
     }
 
     fn take_truth(&mut self, truth: &Truth, limits: Limits) {
@@ -439,10 +472,11 @@ impl Bed {
         }
     }
 
-    /// Beats per minute: estimated, or else counted on the left ventricle.
+    /// Beats per minute: estimated, or else that of the last beat, or counted on the left ventricle.
     pub(super) fn heart_rate_bpm(&self) -> Option<f64> {
         let estimated = self.parameters.iter().find(|p| p.name == "heart_rate").map(|p| p.mean);
-        estimated.or_else(|| self.counted_beats_bpm())
+        let of_beat = || self.of_beat("heart_rate").map(|reading| f64::from(reading.band.mean));
+        estimated.or_else(of_beat).or_else(|| self.counted_beats_bpm())
     }
 
     fn counted_beats_bpm(&self) -> Option<f64> {
@@ -485,15 +519,16 @@ impl Parameter {
     fn new(name: String) -> Self {
         let unit = PARAMETERS.iter().find(|p| p.name == name).map_or("", |p| p.unit);
         let [mean, low, high, since_informed_s] = [f64::NAN; 4];
-        Self { name, unit, mean, low, high, since_informed_s, trend: History::default() }
+        Self { name, unit, mean, low, high, since_informed_s, is_identifiable: true, trend: History::default() }
     }
 
     fn update(&mut self, time_ns: i64, row: &[f64]) {
-        let fields = ["mean", "q05", "q95", "since_informed_s"];
-        let [mean, low, high, since_informed_s] = fields.map(|name| statistic(&PARAMETER_STATISTICS, row, name));
+        let fields = ["mean", "q05", "q95", "since_informed_s", "identifiable"];
+        let [mean, low, high, since_informed_s, identifiable] =
+            fields.map(|name| statistic(&PARAMETER_STATISTICS, row, name));
         self.trend.push(time_ns, Band::from_row(&PARAMETER_STATISTICS, row), TREND);
         let (name, unit, trend) = (std::mem::take(&mut self.name), self.unit, std::mem::take(&mut self.trend));
-        *self = Self { name, unit, mean, low, high, since_informed_s, trend };
+        *self = Self { name, unit, mean, low, high, since_informed_s, is_identifiable: identifiable > 0.5, trend };
     }
 }
 
@@ -503,8 +538,8 @@ fn tame_status(mut status: Status) -> Status {
     for (name, _) in &mut status.counters {
         *name = tame(name, MAX_NAME);
     }
-    for ChannelStatus { name, state, .. } in &mut status.channels {
-        (*name, *state) = (tame(name, MAX_NAME), tame(state, MAX_NAME));
+    for ChannelStatus { name, state, artefact, .. } in &mut status.channels {
+        (*name, *state, *artefact) = (tame(name, MAX_NAME), tame(state, MAX_NAME), tame(artefact, MAX_NAME));
     }
     status
 }
