@@ -17,8 +17,7 @@ use std::process::ExitCode;
 use clap::{Args, Parser, Subcommand};
 use hemostream::edge::bus::BusError;
 use hemostream::edge::config::{Config, ConfigError, Origins};
-use hemostream::edge::files::csv::CsvError;
-use hemostream::edge::files::record::RecordError;
+use hemostream::edge::files::error::FileError;
 use hemostream::edge::replay::ReplayError;
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -78,14 +77,8 @@ impl From<ConfigError> for Failure {
     }
 }
 
-impl From<CsvError> for Failure {
-    fn from(error: CsvError) -> Self {
-        Self::Input(error.to_string())
-    }
-}
-
-impl From<RecordError> for Failure {
-    fn from(error: RecordError) -> Self {
+impl From<FileError> for Failure {
+    fn from(error: FileError) -> Self {
         Self::Input(error.to_string())
     }
 }

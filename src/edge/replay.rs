@@ -6,7 +6,8 @@ use std::time::Duration;
 use super::bus::{Bus, BusError, Delivery, Encoding, Message};
 use super::config::{Config, ConfigError};
 use super::files::csv::Row;
-use super::files::record::{Record, RecordError};
+use super::files::error::FileError;
+use super::files::record::Record;
 use super::synthetic::SyntheticPatient;
 use super::wire::{self, FLAG_LAST_BLOCK, PressureBlock, SCHEMA, ToJson, Truth, WireError};
 use crate::estimate::time::{EventTime, ns_from_s, s_from_ns};
@@ -26,7 +27,7 @@ const LISTENER_LOOKS: u32 = 100;
 pub enum ReplayError {
     /// The record.
     #[error(transparent)]
-    Record(#[from] RecordError),
+    Record(#[from] FileError),
     /// The patient's start.
     #[error(transparent)]
     Config(#[from] ConfigError),
@@ -104,7 +105,7 @@ impl Source {
     ///
     /// # Errors
     /// When it cannot be read.
-    pub fn record(path: &std::path::Path, config: &Config) -> Result<Self, RecordError> {
+    pub fn record(path: &std::path::Path, config: &Config) -> Result<Self, FileError> {
         let reader = Box::new(Record::open(path, config)?);
         Ok(Self::Record { path: path.to_owned(), reader, shift_ns: 0, span: None })
     }

@@ -10,7 +10,8 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value};
 
-use crate::edge::files::csv::{CsvError, TableWriter};
+use crate::edge::files::csv::TableWriter;
+use crate::edge::files::error::FileError;
 use plot::{Figure, PlotError};
 
 /// A table of text.
@@ -162,7 +163,7 @@ pub enum ReportError {
     },
     /// A table.
     #[error(transparent)]
-    Table(#[from] CsvError),
+    Table(#[from] FileError),
     /// A picture.
     #[error(transparent)]
     Plot(#[from] PlotError),

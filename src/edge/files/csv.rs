@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use super::error::FileError;
 use crate::edge::config::Config;
 use crate::estimate::beat::BeatEstimate;
 use crate::estimate::ensemble::ParameterSummary;
@@ -13,31 +14,6 @@ use crate::estimate::time::EventTime;
 use crate::model::Model;
 use crate::model::cvsim6::{Cvsim6, Pressures};
 use crate::model::discrepancy::Circulation;
-
-/// A record or table that cannot be read or written.
-#[derive(Debug, thiserror::Error)]
-pub enum CsvError {
-    /// Opening, reading or writing failed.
-    #[error("{path}: {reason}")]
-    File {
-        /// Which file.
-        path: PathBuf,
-        /// What the system said.
-        reason: String,
-    },
-    /// The content is not a record.
-    #[error("{path}{}: found {found}, expected {expected}", line.map_or_else(String::new, |l| format!(":{l}")))]
-    Content {
-        /// Which file.
-        path: PathBuf,
-        /// Line, counted from 1.
-        line: Option<u64>,
-        /// What is there.
-        found: String,
-        /// What should be.
-        expected: String,
-    },
-}
 
 /// One row of a record.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,21 +41,21 @@ impl RecordReader {
     ///
     /// # Errors
     /// When the file cannot be read, is empty, has no `time_s`, or a column that is no pressure.
-    pub fn open(path: &Path, config: &Config) -> Result<Self, CsvError> {
-        let file = File::open(path).map_err(|e| file_error(path, &e))?;
+    pub fn open(path: &Path, config: &Config) -> Result<Self, FileError> {
+        let file = File::open(path).map_err(|e| FileError::file(path, &e))?;
         let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(file);
         let headers: Vec<String> = reader
             .headers()
-            .map_err(|e| content(path, Some(1), e.to_string(), "a CSV header"))?
+            .map_err(|e| FileError::content(path, Some(1), e.to_string(), "a CSV header"))?
             .iter()
             .map(str::to_owned)
             .collect();
         if headers.is_empty() {
-            return Err(content(path, None, "an empty file", "a CSV header with `time_s` and pressures"));
+            return Err(FileError::content(path, None, "an empty file", "a CSV header with `time_s` and pressures"));
         }
         let Some(time_column) = headers.iter().position(|h| h == "time_s") else {
             let found = format!("columns {}", headers.join(", "));
-            return Err(content(path, Some(1), found, "a column `time_s` [s]"));
+            return Err(FileError::content(path, Some(1), found, "a column `time_s` [s]"));
         };
         let mut states = Vec::new();
         for header in headers.iter().filter(|h| *h != "time_s") {
@@ -87,19 +63,19 @@ impl RecordReader {
             let Some(index) = Pressures::NAMES.iter().position(|name| Some(*name) == state) else {
                 let names = Pressures::NAMES.join(", ");
                 let expected = format!("a pressure ({names}) or a label of the table [labels]");
-                return Err(content(path, Some(1), format!("column `{header}`"), &expected));
+                return Err(FileError::content(path, Some(1), format!("column `{header}`"), &expected));
             };
             if states.contains(&index) {
                 let found = format!("column `{header}`, a second one for {}", Pressures::NAMES[index]);
-                return Err(content(path, Some(1), found, "one column per pressure"));
+                return Err(FileError::content(path, Some(1), found, "one column per pressure"));
             }
             states.push(index);
         }
         if headers.iter().filter(|h| *h == "time_s").count() > 1 {
-            return Err(content(path, Some(1), "two columns `time_s`", "one"));
+            return Err(FileError::content(path, Some(1), "two columns `time_s`", "one"));
         }
         if states.is_empty() {
-            return Err(content(path, Some(1), "no column but `time_s`", "at least one pressure"));
+            return Err(FileError::content(path, Some(1), "no column but `time_s`", "at least one pressure"));
         }
         let record = csv::StringRecord::new();
         Ok(Self { path: path.to_owned(), reader, record, time_column, states, headers, last: None })
@@ -115,14 +91,19 @@ impl RecordReader {
     ///
     /// # Errors
     /// When a cell is not a number, or time does not increase.
-    pub fn next_row(&mut self) -> Result<Option<Row>, CsvError> {
+    pub fn next_row(&mut self) -> Result<Option<Row>, FileError> {
         let more = self.reader.read_record(&mut self.record);
         let line = self.record.position().map(csv::Position::line);
         if !more.map_err(|e| {
-            content(&self.path, e.position().map(csv::Position::line), e.to_string(), "a row like the header")
+            FileError::content(
+                &self.path,
+                e.position().map(csv::Position::line),
+                e.to_string(),
+                "a row like the header",
+            )
         })? {
             if self.last.is_none() {
-                return Err(content(&self.path, None, "no row", "at least one sample"));
+                return Err(FileError::content(&self.path, None, "no row", "at least one sample"));
             }
             return Ok(None);
         }
@@ -137,32 +118,26 @@ impl RecordReader {
                 values.push(Some(self.number(cell, column, line)?));
             }
         }
-        let Some(time) = time else { return Err(content(&self.path, line, "no time", "a number in `time_s`")) };
+        let Some(time) = time else {
+            return Err(FileError::content(&self.path, line, "no time", "a number in `time_s`"));
+        };
         if let Some(last) = self.last.filter(|last| *last >= time) {
             let found = format!("time_s {} after {}", time.as_s(), last.as_s());
-            return Err(content(&self.path, line, found, "strictly increasing times"));
+            return Err(FileError::content(&self.path, line, found, "strictly increasing times"));
         }
         self.last = Some(time);
         Ok(Some(Row { time, values }))
     }
 
-    fn number(&self, cell: &str, column: usize, line: Option<u64>) -> Result<f64, CsvError> {
+    fn number(&self, cell: &str, column: usize, line: Option<u64>) -> Result<f64, FileError> {
         let value = cell.parse::<f64>().ok().filter(|v| column != self.time_column || v.is_finite());
         value.ok_or_else(|| {
             let found = format!("`{cell}` in column `{}`", self.headers.get(column).map_or("", String::as_str));
             let empty =
                 if column == self.time_column { "a number" } else { "a number, or nothing for a missing sample" };
-            content(&self.path, line, found, empty)
+            FileError::content(&self.path, line, found, empty)
         })
     }
-}
-
-fn file_error(path: &Path, error: &dyn std::fmt::Display) -> CsvError {
-    CsvError::File { path: path.to_owned(), reason: error.to_string() }
-}
-
-fn content(path: &Path, line: Option<u64>, found: impl Into<String>, expected: &str) -> CsvError {
-    CsvError::Content { path: path.to_owned(), line, found: found.into(), expected: expected.to_owned() }
 }
 
 /// Writes rows of numbers under a header. Numbers are written so that they read back exactly.
@@ -177,8 +152,8 @@ impl TableWriter {
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn create(path: &Path, header: &[String]) -> Result<Self, CsvError> {
-        let file = File::create(path).map_err(|e| file_error(path, &e))?;
+    pub fn create(path: &Path, header: &[String]) -> Result<Self, FileError> {
+        let file = File::create(path).map_err(|e| FileError::file(path, &e))?;
         let mut table = Self { path: path.to_owned(), writer: BufWriter::new(file), columns: header.len() };
         table.line(header.iter().map(String::as_str))?;
         Ok(table)
@@ -188,13 +163,13 @@ impl TableWriter {
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn row(&mut self, values: &[f64]) -> Result<(), CsvError> {
+    pub fn row(&mut self, values: &[f64]) -> Result<(), FileError> {
         debug_assert_eq!(values.len(), self.columns, "a row has as many cells as the header");
         let cell = |v: &f64| if v.is_nan() { String::new() } else { v.to_string() };
         self.line(values.iter().map(cell))
     }
 
-    fn line(&mut self, cells: impl Iterator<Item = impl AsRef<str>>) -> Result<(), CsvError> {
+    fn line(&mut self, cells: impl Iterator<Item = impl AsRef<str>>) -> Result<(), FileError> {
         let mut line = String::new();
         for (i, cell) in cells.enumerate() {
             if i > 0 {
@@ -203,15 +178,15 @@ impl TableWriter {
             line.push_str(cell.as_ref());
         }
         line.push('\n');
-        self.writer.write_all(line.as_bytes()).map_err(|e| file_error(&self.path, &e))
+        self.writer.write_all(line.as_bytes()).map_err(|e| FileError::file(&self.path, &e))
     }
 
     /// Writes what is buffered.
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn finish(mut self) -> Result<(), CsvError> {
-        self.writer.flush().map_err(|e| file_error(&self.path, &e))
+    pub fn finish(mut self) -> Result<(), FileError> {
+        self.writer.flush().map_err(|e| FileError::file(&self.path, &e))
     }
 }
 
@@ -226,10 +201,10 @@ impl EventWriter {
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn create(path: &Path) -> Result<Self, CsvError> {
-        let file = File::create(path).map_err(|e| file_error(path, &e))?;
+    pub fn create(path: &Path) -> Result<Self, FileError> {
+        let file = File::create(path).map_err(|e| FileError::file(path, &e))?;
         let mut writer = csv::Writer::from_writer(file);
-        writer.write_record(["time_s", "kind", "channel", "text"]).map_err(|e| file_error(path, &e))?;
+        writer.write_record(["time_s", "kind", "channel", "text"]).map_err(|e| FileError::file(path, &e))?;
         Ok(Self { path: path.to_owned(), writer })
     }
 
@@ -237,17 +212,17 @@ impl EventWriter {
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn row(&mut self, time: EventTime, kind: &str, channel: &str, text: &str) -> Result<(), CsvError> {
+    pub fn row(&mut self, time: EventTime, kind: &str, channel: &str, text: &str) -> Result<(), FileError> {
         let time = time.as_s().to_string();
-        self.writer.write_record([time.as_str(), kind, channel, text]).map_err(|e| file_error(&self.path, &e))
+        self.writer.write_record([time.as_str(), kind, channel, text]).map_err(|e| FileError::file(&self.path, &e))
     }
 
     /// Writes what is buffered.
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn finish(mut self) -> Result<(), CsvError> {
-        self.writer.flush().map_err(|e| file_error(&self.path, &e))
+    pub fn finish(mut self) -> Result<(), FileError> {
+        self.writer.flush().map_err(|e| FileError::file(&self.path, &e))
     }
 }
 

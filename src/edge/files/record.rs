@@ -2,30 +2,12 @@
 
 use std::path::Path;
 
-use super::csv::{CsvError, RecordReader, Row};
-use super::wfdb::{self, WfdbError};
+use super::csv::{RecordReader, Row};
+use super::error::FileError;
+use super::wfdb;
 use crate::edge::config::Config;
 use crate::estimate::time::EventTime;
 use crate::model::cvsim6::Pressures;
-
-/// A record that cannot be read.
-#[derive(Debug, thiserror::Error)]
-pub enum RecordError {
-    /// CSV.
-    #[error(transparent)]
-    Csv(#[from] CsvError),
-    /// WFDB.
-    #[error(transparent)]
-    Wfdb(#[from] WfdbError),
-    /// WFDB without anything to estimate from.
-    #[error("{path}: found the signals {found}, expected a pressure in mmHg under a label of the table [labels]")]
-    NoPressure {
-        /// The header.
-        path: std::path::PathBuf,
-        /// What is in it.
-        found: String,
-    },
-}
 
 /// A record, open at its start.
 pub enum Record {
@@ -40,7 +22,7 @@ impl Record {
     ///
     /// # Errors
     /// When it cannot be read or holds no pressure.
-    pub fn open(path: &Path, config: &Config) -> Result<Self, RecordError> {
+    pub fn open(path: &Path, config: &Config) -> Result<Self, FileError> {
         let is_header = path.extension().is_some_and(|ending| ending == "hea");
         if is_header || (!path.exists() && path.with_added_extension("hea").exists()) {
             Ok(Self::Wfdb(WfdbRows::open(path, config)?))
@@ -62,7 +44,7 @@ impl Record {
     ///
     /// # Errors
     /// When it cannot be read on.
-    pub fn next_row(&mut self) -> Result<Option<Row>, RecordError> {
+    pub fn next_row(&mut self) -> Result<Option<Row>, FileError> {
         match self {
             Self::Csv(reader) => Ok(reader.next_row()?),
             Self::Wfdb(rows) => Ok(rows.next_row()),
@@ -91,7 +73,7 @@ impl Samples {
 }
 
 impl WfdbRows {
-    fn open(path: &Path, config: &Config) -> Result<Self, RecordError> {
+    fn open(path: &Path, config: &Config) -> Result<Self, FileError> {
         let record = wfdb::Record::open(path)?;
         let (mut states, mut signals) = (Vec::new(), Vec::new());
         for (index, signal) in record.signals.iter().enumerate() {
@@ -107,7 +89,9 @@ impl WfdbRows {
         }
         if states.is_empty() {
             let names: Vec<String> = record.signals.iter().map(|s| format!("{} [{}]", s.name, s.units)).collect();
-            return Err(RecordError::NoPressure { path: path.to_owned(), found: names.join(", ") });
+            let found = format!("the signals {}", names.join(", "));
+            let expected = "a pressure in mmHg under a label of the table [labels]";
+            return Err(FileError::content(path, None, found, expected));
         }
         Ok(Self { states, signals })
     }

@@ -20,6 +20,8 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
+use super::error::FileError;
+
 /// Longest header \[bytes\]; a segment takes about 20.
 const MAX_HEADER_BYTES: u64 = 1 << 20;
 
@@ -39,31 +41,6 @@ const DEFAULT_UNITS: &str = "mV";
 
 /// Name of a segment, or of a signal file, that stores nothing.
 const NOTHING_STORED: &str = "~";
-
-/// A record that cannot be read.
-#[derive(Debug, thiserror::Error)]
-pub enum WfdbError {
-    /// Opening or reading failed.
-    #[error("{path}: {reason}")]
-    File {
-        /// Which file.
-        path: PathBuf,
-        /// What the system said.
-        reason: String,
-    },
-    /// The header is wrong, or the files it names do not fit it.
-    #[error("{path}{}: found {found}, expected {expected}", line.map_or_else(String::new, |l| format!(":{l}")))]
-    Content {
-        /// Which header.
-        path: PathBuf,
-        /// Line, counted from 1.
-        line: Option<usize>,
-        /// What is there.
-        found: String,
-        /// What should be.
-        expected: String,
-    },
-}
 
 /// One signal of a record.
 #[derive(Debug, Clone, PartialEq)]
@@ -106,7 +83,7 @@ impl Record {
     ///
     /// # Errors
     /// When a header cannot be read or is malformed, or segments do not fit together.
-    pub fn open(path: &Path) -> Result<Self, WfdbError> {
+    pub fn open(path: &Path) -> Result<Self, FileError> {
         let path = match path.extension() {
             Some(extension) if extension == "hea" => path.to_owned(),
             _ => with_suffix(path),
@@ -118,7 +95,7 @@ impl Record {
         }
     }
 
-    fn ordinary(line: RecordLine, source: Ordinary) -> Result<Self, WfdbError> {
+    fn ordinary(line: RecordLine, source: Ordinary) -> Result<Self, FileError> {
         let frames = if source.frames == 0 { source.stored_frames()? } else { source.frames };
         let rate_hz = line.rate_hz.unwrap_or(DEFAULT_RATE_HZ);
         Ok(Self {
@@ -132,7 +109,7 @@ impl Record {
         })
     }
 
-    fn segmented(path: PathBuf, line: RecordLine, lines: &[SegmentLine]) -> Result<Self, WfdbError> {
+    fn segmented(path: PathBuf, line: RecordLine, lines: &[SegmentLine]) -> Result<Self, FileError> {
         let rate_hz = line.rate_hz.unwrap_or(DEFAULT_RATE_HZ);
         // A first segment without samples is the layout: it names the signals and stores none.
         let variable = lines.first().is_some_and(|s| s.frames == 0 && s.name.is_some());
@@ -154,12 +131,12 @@ impl Record {
             if let Some(source) = source.as_ref().filter(|s| s.frames != segment.frames) {
                 let found = format!("a segment of {} frames", segment.frames);
                 let expected = format!("{}, as in {}", source.frames, source.path.display());
-                return Err(content(&path, Some(segment.line), found, &expected));
+                return Err(FileError::content(&path, Some(segment.line), found, &expected));
             }
             segments.push(Segment { frames: segment.frames, source });
         }
         let Some(first) = segments.iter().find_map(|s| s.source.clone()) else {
-            return Err(content(&path, Some(line.line), "gaps only", "a segment with signals"));
+            return Err(FileError::content(&path, Some(line.line), "gaps only", "a segment with signals"));
         };
         let frames = total_frames(&path, &line, lines)?;
         let signals = first.signals(rate_hz);
@@ -171,15 +148,15 @@ impl Record {
     /// # Errors
     /// When there is no such signal, its files are missing, too short or damaged, its segments do not fit together,
     /// or it is too long to be held.
-    pub fn samples(&self, index: usize) -> Result<Vec<f64>, WfdbError> {
+    pub fn samples(&self, index: usize) -> Result<Vec<f64>, FileError> {
         let Some(signal) = self.signals.get(index) else {
             let found = format!("no signal at place {index}");
-            return Err(content(&self.path, None, found, &format!("a place below {}", self.signals.len())));
+            return Err(FileError::content(&self.path, None, found, &format!("a place below {}", self.signals.len())));
         };
         let n_samples = self.frames.saturating_mul(signal.per_frame);
         if n_samples > MAX_SAMPLES {
             let found = format!("{n_samples} samples of `{}`", signal.name);
-            return Err(content(&self.path, None, found, &format!("at most {MAX_SAMPLES}")));
+            return Err(FileError::content(&self.path, None, found, &format!("at most {MAX_SAMPLES}")));
         }
         let mut values = Vec::new();
         for segment in &self.segments {
@@ -196,7 +173,7 @@ impl Record {
         &self,
         segment: &'a Segment,
         index: usize,
-    ) -> Result<Option<(&'a Ordinary, &'a Channel)>, WfdbError> {
+    ) -> Result<Option<(&'a Ordinary, &'a Channel)>, FileError> {
         let Some(source) = &segment.source else { return Ok(None) };
         let signal = &self.signals[index];
         let same_name = |c: &&Channel| c.name == signal.name;
@@ -206,7 +183,7 @@ impl Record {
             if let Some(second) = second {
                 let found = format!("a second signal `{}`", signal.name);
                 let expected = "distinct names where segments differ in their signals";
-                return Err(content(&source.path, Some(second.line), found, expected));
+                return Err(FileError::content(&source.path, Some(second.line), found, expected));
             }
             first
         } else {
@@ -219,14 +196,14 @@ impl Record {
                 |name: &str, units: &str, k: usize| format!("signal `{name}` [{units}], samples per frame: {k}");
             let found = describe(&channel.name, &channel.units, channel.per_frame);
             let expected = describe(&signal.name, &signal.units, signal.per_frame);
-            return Err(content(&source.path, Some(channel.line), found, &format!("{expected}, as before")));
+            return Err(FileError::content(&source.path, Some(channel.line), found, &format!("{expected}, as before")));
         }
         Ok(Some((source, channel)))
     }
 }
 
 /// Sum of the segments, which the record line has to confirm if it gives a length.
-fn total_frames(path: &Path, line: &RecordLine, segments: &[SegmentLine]) -> Result<usize, WfdbError> {
+fn total_frames(path: &Path, line: &RecordLine, segments: &[SegmentLine]) -> Result<usize, FileError> {
     let sum = segments.iter().try_fold(0_usize, |sum, s| sum.checked_add(s.frames));
     match sum {
         Some(sum) if sum > 0 && (line.frames == 0 || line.frames == sum) => Ok(sum),
@@ -234,7 +211,7 @@ fn total_frames(path: &Path, line: &RecordLine, segments: &[SegmentLine]) -> Res
             let found = sum.map_or_else(|| "too many frames".to_owned(), |sum| format!("segments of {sum} frames"));
             let expected =
                 if line.frames == 0 { "at least one".to_owned() } else { format!("{} in total", line.frames) };
-            Err(content(path, Some(line.line), found, &expected))
+            Err(FileError::content(path, Some(line.line), found, &expected))
         }
     }
 }
@@ -251,7 +228,7 @@ struct Ordinary {
 /// A signal as one segment stores it.
 #[derive(Debug)]
 struct Channel {
-    line: usize,
+    line: u64,
     name: String,
     units: String,
     /// None where nothing is stored.
@@ -296,7 +273,7 @@ impl Ordinary {
     }
 
     /// How many whole frames there are in every file.
-    fn stored_frames(&self) -> Result<usize, WfdbError> {
+    fn stored_frames(&self) -> Result<usize, FileError> {
         let mut shortest: Option<usize> = None;
         for channel in &self.channels {
             let Some(stored) = &channel.stored else { continue };
@@ -306,22 +283,27 @@ impl Ordinary {
         }
         match shortest {
             Some(frames) if frames > 0 => Ok(frames),
-            _ => Err(content(&self.path, None, "neither a number of samples nor a stored frame", "one of them")),
+            _ => Err(FileError::content(
+                &self.path,
+                None,
+                "neither a number of samples nor a stored frame",
+                "one of them",
+            )),
         }
     }
 
-    fn open(&self, channel: &Channel, stored: &Stored) -> Result<(File, usize), WfdbError> {
+    fn open(&self, channel: &Channel, stored: &Stored) -> Result<(File, usize), FileError> {
         let path = self.path.with_file_name(&stored.file);
         let opened = File::open(path).and_then(|file| file.metadata().map(|data| (file, data.len())));
         let (file, bytes) = opened.map_err(|error| {
             let found = format!("signal file `{}`: {error}", stored.file);
-            content(&self.path, Some(channel.line), found, "a readable file beside the header")
+            FileError::content(&self.path, Some(channel.line), found, "a readable file beside the header")
         })?;
         Ok((file, usize::try_from(bytes).unwrap_or(usize::MAX)))
     }
 
     /// Appends a signal in physical units.
-    fn read(&self, channel: &Channel, frames: usize, values: &mut Vec<f64>) -> Result<(), WfdbError> {
+    fn read(&self, channel: &Channel, frames: usize, values: &mut Vec<f64>) -> Result<(), FileError> {
         let start = values.len();
         let end = start + frames * channel.per_frame;
         if let Some(stored) = channel.stored.as_ref().filter(|_| frames > 0) {
@@ -341,17 +323,17 @@ impl Ordinary {
         stored: &Stored,
         frames: usize,
         values: &mut Vec<f64>,
-    ) -> Result<i64, WfdbError> {
+    ) -> Result<i64, FileError> {
         let Stored { format, offset, width, first, .. } = *stored;
         let (mut file, bytes) = self.open(channel, stored)?;
         let needed = offset.saturating_add(format.bytes(frames.saturating_mul(width)));
         if bytes < needed {
             let found = format!("signal file `{}` of {bytes} bytes", stored.file);
             let expected = format!("at least {needed}: {frames} frames of {width} samples in format {}", format.code());
-            return Err(content(&self.path, Some(channel.line), found, &expected));
+            return Err(FileError::content(&self.path, Some(channel.line), found, &expected));
         }
         // From here on every number of the header is bounded by the size of the file.
-        let failed = |error| file_error(&self.path.with_file_name(&stored.file), &error);
+        let failed = |error| FileError::file(&self.path.with_file_name(&stored.file), &error);
         file.seek(SeekFrom::Start(offset as u64)).map_err(failed)?;
         values.reserve(frames * channel.per_frame);
         // Two frames always fill whole bytes.
@@ -373,7 +355,7 @@ impl Ordinary {
     }
 
     /// Compares the sum of the samples with the header. Without a length there, that sum is of something else.
-    fn verify(&self, channel: &Channel, stored: &Stored, sum: i64) -> Result<(), WfdbError> {
+    fn verify(&self, channel: &Channel, stored: &Stored, sum: i64) -> Result<(), FileError> {
         let Some(expected) = channel.checksum.filter(|_| self.frames > 0).map(low_16_bits) else { return Ok(()) };
         let sum = low_16_bits(sum);
         if sum == expected {
@@ -381,7 +363,7 @@ impl Ordinary {
         }
         let found = format!("checksum {sum} of `{}` in `{}`", channel.name, stored.file);
         let expected = format!("{expected}: the file is damaged or not the one of this header");
-        Err(content(&self.path, Some(channel.line), found, &expected))
+        Err(FileError::content(&self.path, Some(channel.line), found, &expected))
     }
 }
 
@@ -471,21 +453,26 @@ enum Body {
 }
 
 impl Header {
-    fn read(path: &Path) -> Result<Self, WfdbError> {
+    fn read(path: &Path) -> Result<Self, FileError> {
         let mut bytes = Vec::new();
         let opened = File::open(path).and_then(|f| f.take(MAX_HEADER_BYTES + 1).read_to_end(&mut bytes));
-        opened.map_err(|error| file_error(path, &error))?;
+        opened.map_err(|error| FileError::file(path, &error))?;
         if bytes.len() as u64 > MAX_HEADER_BYTES {
-            return Err(content(path, None, "a longer file", &format!("a header of at most {MAX_HEADER_BYTES} bytes")));
+            return Err(FileError::content(
+                path,
+                None,
+                "a longer file",
+                &format!("a header of at most {MAX_HEADER_BYTES} bytes"),
+            ));
         }
         Self::parse(path, &String::from_utf8_lossy(&bytes))
     }
 
-    fn parse(path: &Path, text: &str) -> Result<Self, WfdbError> {
+    fn parse(path: &Path, text: &str) -> Result<Self, FileError> {
         let lines = text.lines().zip(1..).map(|(text, number)| Line { path, number, text: text.trim() });
         let mut lines = lines.filter(|line| !line.text.is_empty() && !line.text.starts_with('#'));
         let Some(first) = lines.next() else {
-            return Err(content(path, None, "no line but comments", "a record line"));
+            return Err(FileError::content(path, None, "no line but comments", "a record line"));
         };
         let line = RecordLine::parse(&first)?;
         let n_lines = line.n_segments.unwrap_or(line.n_signals);
@@ -508,7 +495,7 @@ impl Header {
 
 /// `NAME[/SEGMENTS] SIGNALS [RATE[/COUNTER[(BASE)]] [SAMPLES [TIME [DATE]]]]`
 struct RecordLine {
-    line: usize,
+    line: u64,
     /// None for an ordinary record.
     n_segments: Option<usize>,
     n_signals: usize,
@@ -519,7 +506,7 @@ struct RecordLine {
 }
 
 impl RecordLine {
-    fn parse(line: &Line) -> Result<Self, WfdbError> {
+    fn parse(line: &Line) -> Result<Self, FileError> {
         let mut fields = Fields(line.text);
         let n_segments = match fields.take().and_then(|name| name.split_once('/')) {
             Some((_, n)) => Some(line.count(n, "number of segments", 1)?),
@@ -544,14 +531,14 @@ impl RecordLine {
 
 /// `NAME SAMPLES`
 struct SegmentLine {
-    line: usize,
+    line: u64,
     /// None for a gap.
     name: Option<String>,
     frames: usize,
 }
 
 impl SegmentLine {
-    fn parse(line: &Line) -> Result<Self, WfdbError> {
+    fn parse(line: &Line) -> Result<Self, FileError> {
         let mut fields = Fields(line.text);
         let name = line.stored_name(fields.take().unwrap_or_default(), "segment")?;
         let frames = line.count(fields.take().unwrap_or_default(), "length of the segment", 0)?;
@@ -559,20 +546,25 @@ impl SegmentLine {
     }
 
     /// The record that is this segment, if it has so many signals and this rate.
-    fn source(&self, path: &Path, name: &str, n_signals: Option<usize>, rate_hz: f64) -> Result<Ordinary, WfdbError> {
+    fn source(&self, path: &Path, name: &str, n_signals: Option<usize>, rate_hz: f64) -> Result<Ordinary, FileError> {
         let own_path = with_suffix(&path.with_file_name(name));
-        let fail = |found: String, expected: &str| content(path, Some(self.line), found, expected);
+        let fail = |found: String, expected: &str| FileError::content(path, Some(self.line), found, expected);
         let header = Header::read(&own_path).map_err(|error| match error {
-            WfdbError::File { path, reason } => {
+            FileError::File { path, reason } => {
                 fail(format!("segment `{name}`: {}: {reason}", path.display()), "a readable header beside this one")
             }
-            content @ WfdbError::Content { .. } => content,
+            content @ FileError::Content { .. } => content,
         })?;
         let Body::Signals(source) = header.body else {
             return Err(fail(format!("segment `{name}` with segments of its own"), "an ordinary record"));
         };
         let fail = |found: String, expected: String| {
-            content(&own_path, Some(header.line.line), found, &format!("{expected}, as in {}", path.display()))
+            FileError::content(
+                &own_path,
+                Some(header.line.line),
+                found,
+                &format!("{expected}, as in {}", path.display()),
+            )
         };
         if let Some(n_signals) = n_signals.filter(|n| *n != source.channels.len()) {
             return Err(fail(format!("signals: {}", source.channels.len()), n_signals.to_string()));
@@ -588,7 +580,7 @@ impl SegmentLine {
 ///
 /// `FILE FORMAT[xPER_FRAME][:SKEW][+OFFSET] [GAIN[(BASELINE)][/UNITS] [RESOLUTION [ZERO [INITIAL [CHECKSUM [BLOCK
 /// [DESCRIPTION]]]]]]]`
-fn channel(line: &Line) -> Result<Channel, WfdbError> {
+fn channel(line: &Line) -> Result<Channel, FileError> {
     let mut fields = Fields(line.text);
     let file = line.stored_name(fields.take().unwrap_or_default(), "signal file")?;
     let (code, modifiers) = split_before(fields.take().unwrap_or_default(), is_modifier);
@@ -625,7 +617,7 @@ fn is_modifier(mark: char) -> bool {
 }
 
 /// Samples per frame, skew and byte offset, in any order.
-fn format_modifiers(line: &Line, mut rest: &str) -> Result<(usize, usize, usize), WfdbError> {
+fn format_modifiers(line: &Line, mut rest: &str) -> Result<(usize, usize, usize), FileError> {
     let (mut per_frame, mut skew, mut offset) = (1, 0, 0);
     while let Some(mark) = rest.chars().next() {
         let (number, next) = split_before(&rest[mark.len_utf8()..], is_modifier);
@@ -640,7 +632,7 @@ fn format_modifiers(line: &Line, mut rest: &str) -> Result<(usize, usize, usize)
 }
 
 /// Gain, baseline and units: `GAIN[(BASELINE)][/UNITS]`.
-fn calibration(line: &Line, field: &str) -> Result<(f64, Option<i64>, String), WfdbError> {
+fn calibration(line: &Line, field: &str) -> Result<(f64, Option<i64>, String), FileError> {
     let (gain, rest) = split_before(field, |c| c == '(' || c == '/');
     let gain = if gain.is_empty() { 0.0 } else { line.number(gain, "ADC gain")? };
     let (baseline, rest) = match rest.strip_prefix('(') {
@@ -663,7 +655,7 @@ fn calibration(line: &Line, field: &str) -> Result<(f64, Option<i64>, String), W
 }
 
 /// Finds the place of each signal in the frames of its file.
-fn group(path: &Path, channels: &mut [Channel]) -> Result<(), WfdbError> {
+fn group(path: &Path, channels: &mut [Channel]) -> Result<(), FileError> {
     let mut seen = BTreeSet::new();
     for channels in channels.chunk_by_mut(|a, b| a.file() == b.file()) {
         let width = channels.iter().fold(0_usize, |sum, c| sum.saturating_add(c.per_frame));
@@ -675,12 +667,17 @@ fn group(path: &Path, channels: &mut [Channel]) -> Result<(), WfdbError> {
             let (format, offset) = *common.get_or_insert(this);
             if first == 0 && !seen.insert(stored.file.clone()) {
                 let found = format!("signal file `{}` again, after another one", stored.file);
-                return Err(content(path, Some(channel.line), found, "the signals of a file one after another"));
+                return Err(FileError::content(
+                    path,
+                    Some(channel.line),
+                    found,
+                    "the signals of a file one after another",
+                ));
             }
             if this != (format, offset) {
                 let found = format!("format {} and byte offset {}", stored.format.code(), stored.offset);
                 let expected = format!("{} and {offset}, as before in `{}`", format.code(), stored.file);
-                return Err(content(path, Some(channel.line), found, &expected));
+                return Err(FileError::content(path, Some(channel.line), found, &expected));
             }
             (stored.width, stored.first) = (width, first);
             first = first.saturating_add(channel.per_frame);
@@ -692,32 +689,32 @@ fn group(path: &Path, channels: &mut [Channel]) -> Result<(), WfdbError> {
 /// A line of a header that is neither empty nor a comment.
 struct Line<'a> {
     path: &'a Path,
-    number: usize,
+    number: u64,
     text: &'a str,
 }
 
 impl Line<'_> {
-    fn fail(&self, found: impl Into<String>, expected: &str) -> WfdbError {
-        content(self.path, Some(self.number), found, expected)
+    fn fail(&self, found: impl Into<String>, expected: &str) -> FileError {
+        FileError::content(self.path, Some(self.number), found, expected)
     }
 
-    fn count(&self, text: &str, what: &str, least: usize) -> Result<usize, WfdbError> {
+    fn count(&self, text: &str, what: &str, least: usize) -> Result<usize, FileError> {
         let count = text.parse().ok().filter(|n| *n >= least);
         count.ok_or_else(|| self.fail(format!("{what} `{text}`"), &format!("a whole number from {least}")))
     }
 
-    fn integer(&self, text: Option<&str>, what: &str) -> Result<Option<i64>, WfdbError> {
+    fn integer(&self, text: Option<&str>, what: &str) -> Result<Option<i64>, FileError> {
         let parse = |t: &str| t.parse().map_err(|_| self.fail(format!("{what} `{t}`"), "an integer"));
         text.map(parse).transpose()
     }
 
-    fn number(&self, text: &str, what: &str) -> Result<f64, WfdbError> {
+    fn number(&self, text: &str, what: &str) -> Result<f64, FileError> {
         let number = text.parse().ok().filter(|n: &f64| n.is_finite());
         number.ok_or_else(|| self.fail(format!("{what} `{text}`"), "a number"))
     }
 
     /// A name that stays in the folder of the header; None where nothing is stored.
-    fn stored_name(&self, name: &str, what: &str) -> Result<Option<String>, WfdbError> {
+    fn stored_name(&self, name: &str, what: &str) -> Result<Option<String>, FileError> {
         if name == NOTHING_STORED {
             return Ok(None);
         }
@@ -753,14 +750,6 @@ fn with_suffix(record: &Path) -> PathBuf {
     name.into()
 }
 
-fn file_error(path: &Path, error: &dyn std::fmt::Display) -> WfdbError {
-    WfdbError::File { path: path.to_owned(), reason: error.to_string() }
-}
-
-fn content(path: &Path, line: Option<usize>, found: impl Into<String>, expected: &str) -> WfdbError {
-    WfdbError::Content { path: path.to_owned(), line, found: found.into(), expected: expected.to_owned() }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -778,7 +767,7 @@ mod tests {
             self
         }
 
-        fn open(&self, name: &str) -> Result<Record, WfdbError> {
+        fn open(&self, name: &str) -> Result<Record, FileError> {
             Record::open(&self.0.path().join(name))
         }
 
