@@ -120,6 +120,57 @@ fn a_column_without_data_is_not_observed() {
     assert!(run(&observed, "a.csv") == run(&padded, "b.csv"));
 }
 
+#[test]
+fn a_wfdb_record_gives_what_the_same_samples_in_a_table_give_with_beats_and_events() {
+    let folder = tempfile::tempdir().unwrap();
+    let (_, observed) = record(folder.path());
+    // 0.05 mmHg per unit, with a baseline; one sample is missing.
+    let (gain, baseline) = (20.0, 100);
+    let mut stored: Vec<[i16; 2]> = Vec::new();
+    let mut table = String::from("time_s,ABP,PAP\n");
+    for (i, row) in read_table(&observed).rows.iter().enumerate() {
+        let units = [1, 2].map(|c| (row[c] * gain).round() as i16 + baseline);
+        let [a, pa] = units.map(|unit| (f64::from(unit - baseline) / gain).to_string());
+        let pa = if i == 200 { String::new() } else { pa };
+        table.push_str(&format!("{},{a},{pa}\n", row[0]));
+        stored.push([units[0], if i == 200 { i16::MIN } else { units[1] }]);
+    }
+    let bytes: Vec<u8> = stored.iter().flatten().flat_map(|unit| unit.to_le_bytes()).collect();
+    let signal = |c: usize, label: &str| {
+        let checksum = stored.iter().fold(0_i16, |sum, units| sum.wrapping_add(units[c]));
+        format!("wave.dat 16 {gain}({baseline})/mmHg 16 0 {} {checksum} 0 {label}", stored[0][c])
+    };
+    let header = format!("wave 2 200 {}\n{}\n{}\n", stored.len(), signal(0, "ABP"), signal(1, "PAP"));
+    let in_folder = |name: &str| folder.path().join(name);
+    std::fs::write(in_folder("wave.dat"), bytes).unwrap();
+    std::fs::write(in_folder("wave.hea"), header).unwrap();
+    std::fs::write(in_folder("table.csv"), table).unwrap();
+
+    let run = |input: &[&str], name: &str| {
+        let outputs = ["estimates", "beats", "events"].map(|what| in_folder(&format!("{name}_{what}.csv")));
+        let mut arguments = vec!["estimate"];
+        arguments.extend(input);
+        arguments.extend(["--output", path(&outputs[0]), "--beats", path(&outputs[1]), "--events", path(&outputs[2])]);
+        arguments.extend(SMALL);
+        let output = hemostream(&arguments);
+        assert!(output.status.success(), "{}", text(&output.stderr));
+        outputs.map(|file| std::fs::read_to_string(file).unwrap())
+    };
+    let of_wave = run(&["--record", path(&in_folder("wave"))], "wave");
+    assert_eq!(of_wave, run(&[path(&in_folder("table.csv"))], "table"));
+    assert_eq!(of_wave, run(&[path(&in_folder("wave.hea"))], "header"), "a header needs no --record");
+
+    let beats = read_table(&in_folder("wave_beats.csv"));
+    assert_eq!(beats.header[..4], ["time_s", "end_s", "heart_rate_mean", "heart_rate_sd"]);
+    assert_eq!(beats.rows.len(), 1, "between the onsets that are seen in 2 s");
+    assert!(beats.rows.iter().all(|row| (row[2] - 72.0).abs() < 0.5), "{:?}", beats.rows);
+    assert!(of_wave[2].starts_with("time_s,kind,channel,text\n0,start,,"), "{}", of_wave[2]);
+
+    let none = hemostream(&["estimate", "--record", path(&in_folder("absent")), "--output", "out.csv"]);
+    assert_eq!(none.status.code(), Some(2));
+    assert!(text(&none.stderr).contains("absent"), "{}", text(&none.stderr));
+}
+
 /// A record that cannot be used: exit code 2, and a message that names file, place, what is there and what should be.
 fn check_bad_record(content: &str, expected: &[&str]) {
     let folder = tempfile::tempdir().unwrap();

@@ -51,9 +51,15 @@ fn fixtures(kind: &str) -> Vec<PathBuf> {
 }
 
 fn presets() -> Vec<PathBuf> {
-    ["config/default.toml", "config/paper.toml", "config/validate.toml", "config/patients/pulmonary_hypertension.toml"]
-        .map(in_repository)
-        .into()
+    [
+        "config/default.toml",
+        "config/paper.toml",
+        "config/validate.toml",
+        "config/recorded.toml",
+        "config/patients/pulmonary_hypertension.toml",
+    ]
+    .map(in_repository)
+    .into()
 }
 
 #[test]

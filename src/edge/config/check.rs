@@ -257,11 +257,16 @@ impl Checker {
             }
             _ => {}
         }
-        let coupled = estimator.coupling == Coupling::Coupled;
-        if !coupled && (estimator.timing != Timing::Config || estimator.smoothing_lag_s > 0.0) {
-            let message =
-                "found another one, expected \"coupled\" where beats are followed or estimates looked back at";
-            self.refuse("estimator.coupling", message);
+        let name = match estimator.coupling {
+            Coupling::Coupled => None,
+            Coupling::Independent => Some("independent"),
+            Coupling::Enkf => Some("enkf"),
+            Coupling::Ukf => Some("ukf"),
+        };
+        let needs_coupled = estimator.timing != Timing::Config || estimator.smoothing_lag_s > 0.0;
+        if let Some(name) = name.filter(|_| needs_coupled) {
+            let expected = "expected \"coupled\" where beats are followed or estimates looked back at";
+            self.refuse("estimator.coupling", format!("found \"{name}\", {expected}"));
         }
         self.whole("estimator.max_iterations", estimator.max_iterations, 1..=100);
         let fraction = (Bound::Excluded(0.0), Bound::Excluded(1.0));
