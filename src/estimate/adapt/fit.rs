@@ -39,9 +39,11 @@ const KEPT_PER_BEAT: f64 = 0.98;
 /// Mean square of the phases above which what comes back is hardly an accident (3 % of the channels that fit).
 const SYSTEMATIC: f64 = 1.7;
 
-/// Beyond these the model does not fit.
-const MISFIT_RECURRENCE: f64 = 3.5;
-const MISFIT_EXCESS: f64 = 300.0;
+/// Beyond this the model does not fit.
+const MISFIT_RECURRENCE: f64 = 3.0;
+/// Nor does it where so much extra noise is needed, and what it covers comes back with the beat (if there is one): with
+/// the right model it is now and then asked for by accident, for some seconds.
+const MISFIT_EXCESS: (f64, f64) = (300.0, 2.0);
 
 /// Innovations of one phase of the beat.
 #[derive(Debug, Clone, Copy, Default)]
@@ -119,17 +121,25 @@ impl ChannelFit {
     /// Mean square of the innovations averaged over beats at the same phase, in units of what noise leaves of them: 1 when
     /// nothing comes back with every beat.
     #[must_use]
-    #[allow(clippy::cast_precision_loss)]
     pub fn recurrence(&self) -> f64 {
+        self.known_recurrence().unwrap_or(1.0)
+    }
+
+    /// None before half a beat has been seen.
+    #[allow(clippy::cast_precision_loss)]
+    fn known_recurrence(&self) -> Option<f64> {
         let square = |phase: &Phase| phase.sum * phase.sum / phase.square_weight;
         let known: Vec<f64> = self.phases.iter().filter(|phase| phase.square_weight > 0.0).map(square).collect();
-        if known.len() < PHASES / 2 { 1.0 } else { known.iter().sum::<f64>() / known.len() as f64 }
+        (known.len() >= PHASES / 2).then(|| known.iter().sum::<f64>() / known.len() as f64)
     }
 
     /// Whether the model does not fit: what it misses comes back with every beat, or is only covered by extra noise.
     #[must_use]
     pub fn is_misfit(&self) -> bool {
-        self.recurrence() > MISFIT_RECURRENCE || self.log_excess > MISFIT_EXCESS.ln()
+        let recurrence = self.known_recurrence();
+        let (excess, at_recurrence) = MISFIT_EXCESS;
+        recurrence.is_some_and(|recurrence| recurrence > MISFIT_RECURRENCE)
+            || self.log_excess > excess.ln() && recurrence.is_none_or(|recurrence| recurrence > at_recurrence)
     }
 
     /// Standard deviation of what the model misses in every beat, as far as it stands out of the noise \[mmHg\]: over the

@@ -1,0 +1,110 @@
+//! The clocks of the members, where a beat did not come when it was due.
+
+use super::{Ensemble, Parallel};
+use crate::estimate::random::exact_normals;
+use crate::estimate::timing::{ClockEdit, WAITING_PHASE};
+use crate::model::Model;
+
+/// Longest time over which a clock that could not be corrected in time is set forth \[s\].
+const MAX_CLOCK_S: f64 = 2.0;
+
+/// Spread of heart rate (relative) and phase (beats) after an onset has set them.
+const RATE_SD: f64 = 0.03;
+
+const PHASE_SD: f64 = 0.01;
+
+impl<M: Model> Ensemble<M> {
+    /// Sets the clocks of the members; `now_s` is the event time at the end of the last window.
+    pub fn edit_clocks(&mut self, edits: &[ClockEdit], now_s: f64, parallel: &dyn Parallel) {
+        let ago = |edit: &ClockEdit| match *edit {
+            ClockEdit::Beat { at_s, .. } => now_s - at_s,
+            ClockEdit::Wait { from_s } => now_s - from_s,
+            ClockEdit::GoOn => 0.0,
+        };
+        self.edits = edits.iter().map(|edit| (self.elapsed_s - ago(edit), *edit)).collect();
+        if let Some((earliest, _)) = self.edits.first() {
+            // Before the clock went wrong, parameters had no reason to move: their paces start again from there, too.
+            self.look_again(*earliest, true, parallel);
+        }
+        // What lies in the present, or could not be remembered.
+        let h = self.settings.window.length_s();
+        self.apply_edits(f64::INFINITY, self.elapsed_s - h);
+        if !self.listening {
+            self.spread_anew();
+        }
+    }
+
+    /// Gives the states the spread that they started with: they have run by a wrong clock.
+    fn spread_anew(&mut self) {
+        let (n, m) = (self.model.n_states(), self.members.len());
+        let draws = exact_normals(n, m, &self.rows(), &mut self.rng);
+        for (s, row) in draws.chunks_exact(m).enumerate() {
+            let sd = self.settings.initial_state_sd[s];
+            self.members.iter_mut().zip(row).for_each(|(member, e)| member.x[s] += sd * e);
+        }
+    }
+
+    /// Applies what falls before `until_s`; clocks stand at `start_s`.
+    pub(super) fn apply_edits(&mut self, until_s: f64, start_s: f64) {
+        while let Some((at_s, edit)) = self.edits.first().copied().filter(|(at_s, _)| *at_s < until_s) {
+            self.edits.remove(0);
+            match edit {
+                ClockEdit::Beat { rate, .. } => self.begin_beat(at_s.max(start_s - MAX_CLOCK_S) - start_s, rate),
+                ClockEdit::Wait { .. } => {
+                    self.clock_waits = true;
+                    self.shift_clocks(|beats| beats.round() - 1.0 + WAITING_PHASE);
+                }
+                ClockEdit::GoOn => self.clock_waits = false,
+            }
+        }
+    }
+
+    /// A beat begins `ahead_s` from where the clocks stand.
+    fn begin_beat(&mut self, ahead_s: f64, rate: Option<f64>) {
+        let Some(cycle) = self.model.cycle() else { return };
+        self.clock_waits = false;
+        let m = self.members.len();
+        let known = !self.estimated.contains(&cycle.rate);
+        let draws = exact_normals(2, m, &self.rows(), &mut self.rng);
+        if let Some(rate) = rate {
+            let (low, high) = self.settings.beliefs[cycle.rate].bounds;
+            for (member, e) in self.members.iter_mut().zip(&draws[..m]) {
+                let sd = if known { 0.0 } else { RATE_SD };
+                member.theta[cycle.rate] = (rate * (sd * e).exp()).clamp(low, high);
+            }
+        }
+        let per_s = self.rate_hz().unwrap_or(0.0);
+        let beats = self.cycles().unwrap_or(0.0);
+        let target = (beats + ahead_s * per_s).round() - ahead_s * per_s;
+        for (member, e) in self.members.iter_mut().zip(&draws[m..]) {
+            // A new rhythm leaves nothing of what the members thought of the old one.
+            let own = if rate.is_some() { 0.0 } else { member.theta[cycle.phase] - beats };
+            let phase = target + own + if known { 0.0 } else { PHASE_SD * e };
+            self.model.set_clock(phase, &mut member.x, &mut member.theta);
+        }
+    }
+
+    /// Moves all clocks alike, their mean to where `to` says.
+    fn shift_clocks(&mut self, to: impl Fn(f64) -> f64) {
+        let (Some(cycle), Some(beats)) = (self.model.cycle(), self.cycles()) else { return };
+        let shift = to(beats) - beats;
+        for member in &mut self.members {
+            let phase = member.theta[cycle.phase] + shift;
+            self.model.set_clock(phase, &mut member.x, &mut member.theta);
+        }
+    }
+
+    /// Mean rate of the cycles \[1/s\].
+    #[allow(clippy::cast_precision_loss)]
+    pub fn rate_hz(&self) -> Option<f64> {
+        let rate = self.model.cycle()?.rate;
+        Some(self.members.iter().map(|member| member.theta[rate]).sum::<f64>() / self.members.len() as f64 / 60.0)
+    }
+
+    /// Cycles counted at the end of the last window, by the mean clock of the members; None in models without cycles.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn cycles(&self) -> Option<f64> {
+        let phase = self.model.cycle()?.phase;
+        Some(self.members.iter().map(|member| member.theta[phase]).sum::<f64>() / self.members.len() as f64)
+    }
+}

@@ -1,0 +1,130 @@
+//! One window of `coupled`: what the members expect, how far off the samples are, what is learnt of that.
+
+use super::{Ensemble, Observation, Parallel, WindowReport};
+use crate::estimate::coupling::coupled;
+use crate::estimate::member::expectations;
+use crate::estimate::random::exact_normals;
+use crate::estimate::smoother::Correction;
+use crate::estimate::statistics::mean_and_sd;
+use crate::model::Model;
+
+/// Longest time between two steps of what wanders \[s\].
+const WANDER_S: f64 = 0.02;
+
+/// Samples of a window against what the members expect.
+#[derive(Debug, Clone, Default)]
+struct Judged {
+    /// Mean of what the members expect \[mmHg\].
+    expected: Vec<f64>,
+    /// Noise that each is taken to have \[mmHg\].
+    sd: Vec<f64>,
+    /// Observed minus expected, in units of the stated noise.
+    residuals: Vec<f64>,
+    /// The sd that members and noise give it \[mmHg\].
+    expected_sd: Vec<f64>,
+    /// Observed minus expected in that unit.
+    innovations: Vec<f64>,
+}
+
+impl<M: Model> Ensemble<M> {
+    /// Whether the pace of an estimated parameter is learnt. Where a pull to a centre is believed in, pace and pull are a
+    /// statement about how far it gets, to be left as it is. The phase of the clock moves by itself, which is no pace of
+    /// its own, and its rate is heard of once in a beat only: what is larger than their drift is left to those who listen
+    /// for beats.
+    pub(super) fn learns_pace(&self, k: usize) -> bool {
+        let p = self.estimated[k];
+        let is_clock = self.model.cycle().is_some_and(|cycle| cycle.phase == p || cycle.rate == p);
+        !is_clock && self.settings.beliefs[p].reversion <= 0.0
+    }
+
+    pub(super) fn first_look(&mut self, observations: &[Observation], h: f64, parallel: &dyn Parallel) -> WindowReport {
+        self.apply_edits(self.elapsed_s + h, self.elapsed_s);
+        self.wander_due_s += h;
+        // Between samples a little at a time is enough.
+        if !observations.is_empty() || self.wander_due_s >= WANDER_S {
+            self.wander();
+        }
+        if observations.is_empty() {
+            return self.learn(observations, &[], &[], parallel);
+        }
+        parallel.for_each(&mut self.members, &|_, member| {
+            member.forecast(&self.model, observations, &self.settings, 0.0);
+        });
+        let judged = self.judge(observations);
+        if !self.listening {
+            let report = self.learn(&[], &[], &[], parallel);
+            return WindowReport { innovations: judged.innovations, expected: judged.expected, ..report };
+        }
+        let rows = self.rows();
+        let noise = exact_normals(observations.len(), self.members.len(), &rows, &mut self.rng);
+        coupled::covariance_root(&rows, self.members.len(), &mut self.root);
+        let inflation = self.settings.drift.inflation.powf(h);
+        if inflation > 1.0 {
+            self.root.iter_mut().for_each(|r| *r *= inflation.sqrt());
+        }
+        if self.held {
+            self.fix_parameters();
+        }
+        if self.settings.live.smoothing_lag_ns > 0 {
+            self.correct_the_past(observations, &judged.sd, &noise);
+        }
+        let report = self.learn(observations, &judged.sd, &noise, parallel);
+        // Clocks stand at the end of the window by now.
+        let clock = self.model.cycle().zip(self.cycles());
+        for (j, o) in observations.iter().enumerate().filter(|_| !self.held) {
+            let phase = clock.map(|(cycle, cycles)| {
+                let rate = self.members[0].theta[cycle.rate] / 60.0;
+                (cycles - (1.0 - o.s) * h * rate).rem_euclid(1.0)
+            });
+            let (residual, innovation) = (judged.residuals[j], judged.innovations[j]);
+            self.fits[o.channel].hear(self.elapsed_s + o.s * h, phase, residual, judged.expected_sd[j], innovation);
+        }
+        WindowReport { innovations: judged.innovations, expected: judged.expected, ..report }
+    }
+
+    /// Takes the parameters out of what a window can move, but for the phase of the clock.
+    fn fix_parameters(&mut self) {
+        let (n, n_u) = (self.model.n_states(), self.unknowns.len(self.model.n_states()));
+        let phase = self.model.cycle().map(|cycle| cycle.phase);
+        for (k, _) in self.estimated.iter().enumerate().filter(|(_, p)| Some(**p) != phase) {
+            self.root[(n + k) * n_u..(n + k + 1) * n_u].fill(0.0);
+        }
+    }
+
+    fn correct_the_past(&mut self, observations: &[Observation], sd: &[f64], noise: &[f64]) {
+        let m = self.members.len();
+        let expected = expectations(&self.members, sd.len());
+        let off: Vec<f64> = expected
+            .iter()
+            .zip(noise)
+            .enumerate()
+            .map(|(k, (expected, e))| observations[k / m].value + sd[k / m] * e - expected)
+            .collect();
+        if let Some(correction) = Correction::new(&expected, &off, sd, m) {
+            // What is looked at again has corrected the times before it already.
+            self.smoother.correct(&correction, self.second_look.unwrap_or(0));
+        }
+    }
+
+    /// What the members expect of the samples, and how far off each sample is.
+    #[allow(clippy::cast_precision_loss)]
+    fn judge(&self, observations: &[Observation]) -> Judged {
+        let mut judged = Judged::default();
+        for (j, o) in observations.iter().enumerate() {
+            let expected: Vec<f64> = self.members.iter().map(|member| member.expected[j]).collect();
+            let (mean, spread) = mean_and_sd(&expected);
+            let stated = self.settings.channels[o.channel].noise_sd_mmhg;
+            let noise = stated * self.fits[o.channel].noise_factor();
+            let expected_sd = (spread * spread + noise * noise).sqrt();
+            let innovation = (o.value - mean) / expected_sd;
+            // A heavy tail (Huber): what is far off may be an artefact and pulls no more than what is just credible.
+            let far = innovation.abs() / self.settings.adaptation.outlier_sd;
+            judged.sd.push(if far > 1.0 { noise * far.sqrt() } else { noise });
+            judged.residuals.push((o.value - mean) / stated);
+            judged.expected.push(mean);
+            judged.expected_sd.push(expected_sd);
+            judged.innovations.push(innovation);
+        }
+        judged
+    }
+}

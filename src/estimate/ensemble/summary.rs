@@ -1,0 +1,167 @@
+//! What the members say together.
+
+use super::Ensemble;
+use crate::estimate::member::Member;
+use crate::estimate::smoother::Remembered;
+use crate::estimate::statistics::{Explainers, Summary, mean_and_sd, summarise};
+use crate::estimate::time::EventTime;
+use crate::model::Model;
+
+/// A parameter is identifiable when data have halved the sd it started with.
+const IDENTIFIABLE: f64 = 0.75;
+
+/// An estimated parameter.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ParameterSummary {
+    /// Index into the model's parameters.
+    pub parameter: usize,
+    /// Its distribution.
+    pub summary: Summary,
+    /// Share of the starting variance (of its coordinate) that data have removed: 0 nothing, 1 all.
+    pub identifiability: f64,
+}
+
+impl ParameterSummary {
+    /// Whether the data say so much about it that its value is theirs rather than that of the settings.
+    #[must_use]
+    pub fn is_identifiable(&self) -> bool {
+        self.identifiability >= IDENTIFIABLE
+    }
+}
+
+/// Scratch of [`Ensemble::summarise_at`].
+#[derive(Debug, Clone, Default)]
+pub struct Snapshot {
+    values: Vec<f64>,
+    row: Vec<f64>,
+    phi: Vec<f64>,
+}
+
+impl<M: Model> Ensemble<M> {
+    /// States and derived quantities of all members at position `s` of the last window, `[n_quantities x n_members]`,
+    /// states first.
+    pub fn snapshot<'a>(&self, s: f64, scratch: &'a mut Snapshot) -> &'a mut [f64] {
+        let (n, m) = (self.model.n_states(), self.members.len());
+        let n_q = n + self.model.derived().len();
+        scratch.values.resize(n_q * m, 0.0);
+        scratch.row.resize(n_q, 0.0);
+        let t = s * self.settings.window.length_s();
+        for (i, member) in self.members.iter().enumerate() {
+            let (x, derived) = scratch.row.split_at_mut(n);
+            member.state_at(&self.model, s, &mut scratch.phi, x);
+            self.model.derive(t, x, &member.solution.theta, derived);
+            for (q, value) in scratch.row.iter().enumerate() {
+                scratch.values[q * m + i] = *value;
+            }
+        }
+        &mut scratch.values
+    }
+
+    /// One summary per quantity of [`Ensemble::snapshot`].
+    pub fn summarise_at(&self, s: f64, scratch: &mut Snapshot) -> Vec<Summary> {
+        self.summarise(self.snapshot(s, scratch))
+    }
+
+    /// One summary per row of `values` `[n_quantities x n_members]`, states first.
+    fn summarise(&self, values: &mut [f64]) -> Vec<Summary> {
+        let (n, m) = (self.model.n_states(), self.members.len());
+        let explainers = Explainers::new(&values[(n - self.model.n_discrepancies()) * m..n * m], m);
+        let noise = |q: usize| self.settings.aleatoric_sd_mmhg.get(q).copied().unwrap_or(0.0);
+        let phase = self.cycles().map(|cycles| cycles.rem_euclid(1.0));
+        let systematic = |q: usize| {
+            let own = self.settings.channels.iter().position(|c| c.state == q);
+            own.map_or(0.0, |channel| self.fits[channel].systematic_sd(phase))
+        };
+        let summary = |(q, row): (usize, &mut [f64])| {
+            let share = explainers.share_of(row);
+            summarise(row, noise(q), share).widened(systematic(q))
+        };
+        values.chunks_exact_mut(m).enumerate().map(summary).collect()
+    }
+
+    /// A parameter of every member at the end of the last window.
+    pub fn parameter_of_members(&self, parameter: usize) -> impl ExactSizeIterator<Item = f64> + '_ {
+        self.members.iter().map(move |member| member.theta[parameter])
+    }
+
+    /// The estimated parameters at the end of the last window.
+    pub fn summarise_parameters(&self) -> Vec<ParameterSummary> {
+        let summary = |(k, &p): (usize, &usize)| {
+            let mut values: Vec<f64> = self.members.iter().map(|member| member.theta[p]).collect();
+            self.parameter_summary(k, &mut values, self.coordinate(k).1)
+        };
+        self.estimated.iter().enumerate().map(summary).collect()
+    }
+
+    fn parameter_summary(&self, k: usize, values: &mut [f64], coordinate_sd: f64) -> ParameterSummary {
+        let share = coordinate_sd / self.initial_sd[k];
+        ParameterSummary {
+            parameter: self.estimated[k],
+            summary: summarise(values, 0.0, 0.0),
+            identifiability: if share.is_finite() { (1.0 - share * share).clamp(0.0, 1.0) } else { 0.0 },
+        }
+    }
+
+    /// States and estimated parameters of every member at the end of the last window,
+    /// `[n_members x (n_states + n_estimated)]`.
+    pub fn members_at_end(&self) -> Vec<f64> {
+        let row = |member: &Member| -> Vec<f64> {
+            member.x.iter().copied().chain(self.estimated.iter().map(|&p| member.theta[p])).collect()
+        };
+        self.members.iter().flat_map(row).collect()
+    }
+
+    /// Keeps the members at position `s` of the last window, to be corrected by what comes.
+    pub fn remember(&mut self, time: EventTime, s: f64) {
+        let mut moment = Remembered { time, window: self.window - 1, s, rows: Vec::new(), theta: Vec::new() };
+        self.fill(&mut moment);
+        self.smoother.remember(moment);
+    }
+
+    /// The members at a moment of the last window.
+    pub(super) fn fill(&self, moment: &mut Remembered) {
+        let (n, m) = (self.model.n_states(), self.members.len());
+        moment.rows.clear();
+        moment.rows.resize((n + self.estimated.len()) * m, 0.0);
+        let mut x = vec![0.0; n];
+        let mut phi = Vec::new();
+        let ahead_s = moment.s * self.settings.window.length_s();
+        for (i, member) in self.members.iter().enumerate() {
+            member.state_at(&self.model, moment.s, &mut phi, &mut x);
+            x.iter().enumerate().for_each(|(s, x)| moment.rows[s * m + i] = *x);
+            let mut theta = member.solution.theta.clone();
+            self.model.advance(ahead_s, &mut theta);
+            for (k, &p) in self.estimated.iter().enumerate() {
+                moment.rows[(n + k) * m + i] = self.transforms[k].forward(theta[p]);
+            }
+            if i == 0 {
+                moment.theta = theta;
+            }
+        }
+    }
+
+    /// The oldest remembered moment that is not after `until`: its time, a summary per quantity and per parameter.
+    pub fn smoothed(&mut self, until: EventTime) -> Option<(EventTime, Vec<Summary>, Vec<ParameterSummary>)> {
+        let moment = self.smoother.release(until)?;
+        let (n, m) = (self.model.n_states(), self.members.len());
+        let n_d = self.model.derived().len();
+        let mut values = vec![0.0; (n + n_d) * m];
+        let mut parameters = vec![0.0; self.estimated.len() * m];
+        let (mut x, mut derived, mut theta) = (vec![0.0; n], vec![0.0; n_d], moment.theta.clone());
+        for i in 0..m {
+            x.iter_mut().enumerate().for_each(|(s, x)| *x = moment.rows[s * m + i]);
+            for (k, &p) in self.estimated.iter().enumerate() {
+                theta[p] = self.settings.beliefs[p].value(self.transforms[k], moment.rows[(n + k) * m + i]);
+                parameters[k * m + i] = theta[p];
+            }
+            self.model.derive(0.0, &x, &theta, &mut derived);
+            x.iter().chain(&derived).enumerate().for_each(|(q, value)| values[q * m + i] = *value);
+        }
+        let summaries = parameters.chunks_exact_mut(m).enumerate().map(|(k, row)| {
+            let coordinates: Vec<f64> = row.iter().map(|v| self.transforms[k].forward(*v)).collect();
+            self.parameter_summary(k, row, mean_and_sd(&coordinates).1)
+        });
+        let summaries = summaries.collect();
+        Some((moment.time, self.summarise(&mut values), summaries))
+    }
+}
