@@ -24,17 +24,19 @@ pub struct BeatFollower {
     onset_s: Option<f64>,
     /// `[n_quantities x n_members]`; `mean` is the integral so far, `change` the value at the start.
     extents: Vec<Extent>,
+    /// How far the clock of each member was ahead of that of the ensemble at the start \[beats\].
+    ahead: Vec<f64>,
 }
 
 impl BeatFollower {
-    /// Takes in all members at one time, `[n_quantities x n_members]`, states first; `beats` is the clock of the ensemble.
+    /// Takes in all members at one time, `[n_quantities x n_members]`, states first; the clock of the ensemble says how
+    /// many beats there were and how fast they follow each other \[1/s\]. `theta` gives the parameters of a member.
     /// Returns the beat that ended, if one did.
-    /// `theta` gives the parameters of a member.
     pub fn follow<'t, M: Model>(
         &mut self,
         model: &M,
         time: EventTime,
-        beats: f64,
+        (beats, rate_hz): (f64, f64),
         values: &[f64],
         theta: &dyn Fn(usize) -> &'t [f64],
     ) -> Option<BeatEstimate> {
@@ -43,8 +45,13 @@ impl BeatFollower {
         let mut over = None;
         if beats.floor() > beats_before.floor() {
             // The onset lies between two windows; flows through the outlets are zero there.
-            let onset_s = time.as_s() - dt_s * (beats - beats.floor()) / (beats - beats_before);
-            over = self.onset_s.map(|start_s| self.read(model, (start_s, onset_s), values, theta));
+            let onset_s = time.as_s() - ((beats - beats.floor()) / rate_hz).min(dt_s);
+            let phase = model.cycle().map(|cycle| cycle.phase);
+            let ahead = |i: usize| phase.map_or(0.0, |phase| theta(i)[phase] - beats);
+            let members = values.len() / (model.n_states() + model.derived().len());
+            let ahead: Vec<f64> = (0..members).map(ahead).collect();
+            over = self.onset_s.map(|start_s| self.read(model, (start_s, onset_s), (values, &ahead), theta));
+            self.ahead = ahead;
             self.onset_s = Some(onset_s);
             self.extents.clear();
             self.extents.extend(values.iter().map(|v| Extent { change: *v, ..Extent::EMPTY }));
@@ -61,7 +68,7 @@ impl BeatFollower {
         &self,
         model: &M,
         (start_s, end_s): (f64, f64),
-        values: &[f64],
+        (values, ahead): (&[f64], &[f64]),
         theta: &dyn Fn(usize) -> &'t [f64],
     ) -> BeatEstimate {
         let n_q = model.n_states() + model.derived().len();
@@ -76,7 +83,10 @@ impl BeatFollower {
             };
             let (states, derived): (Vec<_>, Vec<_>) =
                 ((0..model.n_states()).map(whole).collect(), (model.n_states()..n_q).map(whole).collect());
-            model.read_cycle(duration_s, theta(i), &states, &derived, &mut row);
+            // The extents are those of the same stretch of time for all; a member thinks that it was a little more or less
+            // than one beat.
+            let own_s = duration_s / (1.0 + ahead[i] - self.ahead[i]).max(0.1);
+            model.read_cycle(own_s, theta(i), &states, &derived, &mut row);
             row.iter().enumerate().for_each(|(k, value)| read[k * members + i] = *value);
         }
         BeatEstimate {

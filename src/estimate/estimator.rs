@@ -5,7 +5,6 @@
 use std::collections::BTreeMap;
 
 use super::adapt::fit::ChannelFit;
-use super::beat::BeatFollower;
 use super::ensemble::{Ensemble, Observation, Parallel, Serial, Snapshot, WindowReport, with_companions};
 pub use super::messages::{ChannelHealth, Disagreement, Estimate, Input, Notice, NoticeKind, Output, WindowDone};
 use super::settings::{EstimatorSettings, SettingsError};
@@ -79,7 +78,6 @@ pub struct Estimator<M> {
     /// When each estimated parameter last began to move, or the start.
     calm_since: Vec<EventTime>,
     want_members: bool,
-    beat: BeatFollower,
     scratch: Snapshot,
 }
 
@@ -112,7 +110,6 @@ impl<M: Model> Estimator<M> {
             informed: Vec::new(),
             calm_since: Vec::new(),
             want_members: false,
-            beat: BeatFollower::default(),
             scratch: Snapshot::default(),
         })
     }
@@ -247,7 +244,6 @@ impl<M: Model> Estimator<M> {
             out.push(notice(self.time(), NoticeKind::Restart, None));
         }
         self.last_observation = None;
-        self.beat = BeatFollower::default();
         self.second = None;
         self.tracker = tracker(&self.settings);
         for tally in &mut self.tallies {
@@ -261,10 +257,11 @@ impl<M: Model> Estimator<M> {
         if first {
             let drawn = Ensemble::new(self.model.clone(), self.settings.clone(), window.start.as_s(), parallel);
             // Checked when the estimator was made; a failure here leaves the bed without estimates, visibly.
-            let Ok(ensemble) = drawn else {
+            let Ok(mut ensemble) = drawn else {
                 out.push(notice(window.start, NoticeKind::WindowFailed, None));
                 return;
             };
+            ensemble.follow_beats(window.start);
             self.informed = vec![window.start; ensemble.estimated().len()];
             self.calm_since.clone_from(&self.informed);
             self.second = self.settings.live.second_opinion.and_then(|coupling| {
@@ -298,7 +295,8 @@ impl<M: Model> Estimator<M> {
         self.tally(window.end, &observations, &report, out);
         self.keep_time(window, &observations, &report, parallel, out);
         self.publish(window, &observations, first, out);
-        self.follow_beat(window.end, out);
+        let beats = self.ensemble.iter_mut().flat_map(Ensemble::take_beats);
+        out.extend(beats.map(Output::Beat));
         let samples = observations.len();
         out.push(Output::Window(WindowDone { end: window.end, closed_at: window.closed_at, samples, report }));
     }
@@ -397,15 +395,6 @@ impl<M: Model> Estimator<M> {
             if *informed {
                 *at = end;
             }
-        }
-    }
-
-    fn follow_beat(&mut self, end: EventTime, out: &mut Vec<Output>) {
-        let Some(ensemble) = &self.ensemble else { return };
-        if let Some(beats) = ensemble.cycles() {
-            let values = ensemble.snapshot(1.0, &mut self.scratch);
-            let over = self.beat.follow(&self.model, end, beats, values, &|member| ensemble.theta_of(member));
-            out.extend(over.map(Output::Beat));
         }
     }
 

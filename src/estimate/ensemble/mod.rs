@@ -1,5 +1,6 @@
 //! The members, and one step of all of them over one window.
 
+mod beats;
 mod clock;
 mod look;
 mod review;
@@ -9,6 +10,7 @@ mod summary;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
+use self::beats::Beats;
 use self::review::Memory;
 pub use self::setup::with_companions;
 use self::setup::{channel_fit, check, draw_bases};
@@ -126,6 +128,7 @@ pub struct Ensemble<M> {
     clock_waits: bool,
     /// When on the clock of `elapsed_s`, and what; in order of time.
     edits: Vec<(f64, ClockEdit)>,
+    beats: Option<Beats>,
 }
 
 impl<M: Model> Ensemble<M> {
@@ -196,6 +199,7 @@ impl<M: Model> Ensemble<M> {
             held: false,
             clock_waits: false,
             edits: Vec::new(),
+            beats: None,
         };
         ensemble.initial_sd = (0..ensemble.estimated.len()).map(|k| ensemble.coordinate(k).1).collect();
         if ensemble.settings.coupling == CouplingKind::Ukf {
@@ -244,10 +248,16 @@ impl<M: Model> Ensemble<M> {
             CouplingKind::Ukf => self.ukf_step(observations, h),
         };
         if self.settings.coupling != CouplingKind::Coupled {
-            self.elapsed_s += h;
-            self.window += 1;
+            self.end_window(h);
         }
         report
+    }
+
+    /// What follows every window, whatever solved it.
+    fn end_window(&mut self, h: f64) {
+        self.elapsed_s += h;
+        self.window += 1;
+        self.follow();
     }
 
     /// Whether parameters stay as they are, but for the phase of the clock.

@@ -5,6 +5,8 @@ use std::collections::VecDeque;
 use super::{Ensemble, Observation, Parallel, WindowReport};
 use crate::estimate::adapt::fit::ChannelFit;
 use crate::estimate::adapt::pace::Pace;
+use crate::estimate::beat::BeatFollower;
+use crate::estimate::time::EventTime;
 use crate::estimate::timing::TimingSource;
 use crate::model::Model;
 
@@ -27,6 +29,7 @@ pub(super) struct Checkpoint {
     elapsed_s: f64,
     window: u64,
     clock_waits: bool,
+    beat: Option<(BeatFollower, EventTime)>,
 }
 
 /// The last moments, to be looked at again.
@@ -90,8 +93,7 @@ impl<M: Model> Ensemble<M> {
     /// One window, remembered.
     fn look(&mut self, observations: &[Observation], h: f64, parallel: &dyn Parallel) -> WindowReport {
         let report = self.first_look(observations, h, parallel);
-        self.elapsed_s += h;
-        self.window += 1;
+        self.end_window(h);
         // Nothing else is ever looked at again.
         if self.settings.adaptation.pace || self.settings.live.timing != TimingSource::Clock {
             self.memory.note(observations);
@@ -141,6 +143,7 @@ impl<M: Model> Ensemble<M> {
             elapsed_s: self.elapsed_s,
             window: self.window,
             clock_waits: self.clock_waits,
+            beat: self.beats.as_ref().map(|beats| (beats.follower.clone(), beats.end)),
         }
     }
 
@@ -154,5 +157,9 @@ impl<M: Model> Ensemble<M> {
         self.elapsed_s = checkpoint.elapsed_s;
         self.window = checkpoint.window;
         self.clock_waits = checkpoint.clock_waits;
+        if let Some((beats, (follower, end))) = self.beats.as_mut().zip(checkpoint.beat.as_ref()) {
+            beats.follower.clone_from(follower);
+            beats.end = *end;
+        }
     }
 }
