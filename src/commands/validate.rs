@@ -29,7 +29,7 @@ const QUICK_SECONDS: f64 = 8.0;
 const LENGTHS_S: std::ops::RangeInclusive<f64> = 4.0..=600.0;
 
 /// Records per patient: a single one says as much about its own noise and start as about the filters.
-const SEEDS: u64 = 3;
+const SEEDS: u64 = 5;
 
 /// Members of a quick experiment.
 const QUICK: &str = "estimator.members=30";
@@ -56,7 +56,7 @@ pub(crate) struct Validate {
     #[arg(long = "scenario", value_name = "NAME", default_value = "step",
           value_parser = PossibleValuesParser::new(scenario_names()))]
     scenarios: Vec<String>,
-    /// Records of every patient, each with another start, noise and wandering [default: 3, quick 1]
+    /// Records of every patient, each with another start, noise and wandering [default: 5, quick 1]
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1000))]
     seeds: Option<u64>,
     /// Length of a record [default: 24, quick 8]

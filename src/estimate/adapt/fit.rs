@@ -13,8 +13,10 @@ const BLOCK_MIN: usize = 5;
 /// Longest time between neighbours \[s\].
 const NEIGHBOURS_S: f64 = 0.1;
 
-/// Memory of the noise, in samples; as many samples' worth of belief in the setting at the start.
+/// Memory of the noise, in samples, and how many samples' worth the setting is at the start: a wrong one must not be
+/// taken for a model that does not fit.
 const NOISE_MEMORY: f64 = 1000.0;
+const NOISE_BELIEF: f64 = 100.0;
 
 /// Memory of the mean squares of blocks \[s\]: some tens of blocks each.
 const MEMORY_S: [f64; 2] = [4.0, 10.0];
@@ -22,8 +24,10 @@ const MEMORY_S: [f64; 2] = [4.0, 10.0];
 /// Largest square of a block that counts: a beat that the model missed is not a thousand.
 const MAX_SQUARE: f64 = 9.0;
 
-/// Above this mean square of blocks the states are believed to do what the model does not say.
-const ARMED: f64 = 1.3;
+/// Above this mean square of blocks the states are believed to do what the model does not say: by itself, and where
+/// as much comes back with the beat.
+const ARMED: [f64; 2] = [1.5, 1.3];
+const ARMED_RECURRENCE: f64 = 2.0;
 
 /// Mean square that extra noise aims at once it is.
 const AIM: f64 = 1.2;
@@ -36,14 +40,14 @@ const GAIN_PER_S: [f64; 2] = [2.0, 0.7];
 const PHASES: usize = 16;
 const KEPT_PER_BEAT: f64 = 0.98;
 
-/// Mean square of the phases above which what comes back is hardly an accident (3 % of the channels that fit).
-const SYSTEMATIC: f64 = 1.7;
+/// Mean square of the phases up to which what comes back may well be an accident.
+const SYSTEMATIC: f64 = 1.4;
 
 /// Beyond this the model does not fit.
 const MISFIT_RECURRENCE: f64 = 3.0;
 /// Nor does it where so much extra noise is needed, and what it covers comes back with the beat (if there is one): with
 /// the right model it is now and then asked for by accident, for some seconds.
-const MISFIT_EXCESS: (f64, f64) = (300.0, 2.0);
+const MISFIT_EXCESS: f64 = 300.0;
 
 /// Innovations of one phase of the beat.
 #[derive(Debug, Clone, Copy, Default)]
@@ -66,6 +70,8 @@ pub struct ChannelFit {
     noise_range: (f64, f64),
     /// Square of the noise over that stated.
     noise_square: f64,
+    /// Samples that it rests on.
+    noise_weight: f64,
     /// Residual \[in stated noise sd\] and time of the last sample.
     last: Option<(f64, f64)>,
     /// Blocks: start, sum of normalised innovations, their number.
@@ -89,6 +95,7 @@ impl ChannelFit {
         Self {
             noise_range,
             noise_square: 1.0,
+            noise_weight: NOISE_BELIEF,
             last: None,
             blocks: [(f64::NEG_INFINITY, 0.0, 0); 2],
             whiteness: [1.0; 2],
@@ -137,9 +144,8 @@ impl ChannelFit {
     #[must_use]
     pub fn is_misfit(&self) -> bool {
         let recurrence = self.known_recurrence();
-        let (excess, at_recurrence) = MISFIT_EXCESS;
         recurrence.is_some_and(|recurrence| recurrence > MISFIT_RECURRENCE)
-            || self.log_excess > excess.ln() && recurrence.is_none_or(|recurrence| recurrence > at_recurrence)
+            || self.log_excess > MISFIT_EXCESS.ln() && recurrence.is_none_or(|recurrence| recurrence > ARMED_RECURRENCE)
     }
 
     /// Standard deviation of what the model misses in every beat, as far as it stands out of the noise \[mmHg\]: over the
@@ -147,7 +153,8 @@ impl ChannelFit {
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn systematic_sd(&self, phase: Option<f64>) -> f64 {
-        if self.recurrence() < SYSTEMATIC {
+        let recurrence = self.recurrence();
+        if recurrence <= SYSTEMATIC {
             return 0.0;
         }
         // The square of a mean is larger than that of what it estimates, by the variance of the mean.
@@ -155,7 +162,9 @@ impl ChannelFit {
         let known: Vec<f64> = self.phases.iter().filter(|phase| phase.weight > 0.0).map(square).collect();
         let mean = known.iter().sum::<f64>() / known.len() as f64;
         let here = phase.map(|phase| &self.phases[bin(phase)]).filter(|phase| phase.weight > 0.0).map_or(0.0, square);
-        (mean.max(here) * self.variance).max(0.0).sqrt()
+        // The less it stands out, the more of it is chance that has been picked.
+        let share = (recurrence - SYSTEMATIC) / (recurrence - 1.0);
+        (share * mean.max(here) * self.variance).max(0.0).sqrt()
     }
 
     /// Hears of a sample: its time and phase of the beat in `[0, 1)`, residual in units of the stated noise, and the sd
@@ -172,7 +181,8 @@ impl ChannelFit {
             let square = 0.5 * (residual - before) * (residual - before);
             // Spikes are not noise.
             let square = square.min(MAX_SQUARE * self.noise_square);
-            self.noise_square += (square - self.noise_square) / NOISE_MEMORY;
+            self.noise_weight = (self.noise_weight + 1.0).min(NOISE_MEMORY);
+            self.noise_square += (square - self.noise_square) / self.noise_weight;
         }
         self.last = Some((residual, time_s));
         for (block, length_s) in BLOCKS_S.into_iter().enumerate() {
@@ -214,7 +224,8 @@ impl ChannelFit {
         let length_s = BLOCKS_S[block];
         self.whiteness[block] += length_s / MEMORY_S[block] * (square - self.whiteness[block]);
         let step = GAIN_PER_S[block] * length_s * (square - AIM);
-        let step = if self.whiteness() > ARMED { step } else { step.min(0.0) };
+        let armed = ARMED[usize::from(self.recurrence() > ARMED_RECURRENCE)];
+        let step = if self.whiteness() > armed { step } else { step.min(0.0) };
         self.log_excess = (self.log_excess + step).clamp(0.0, self.max_log_excess);
     }
 }
