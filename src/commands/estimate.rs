@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use hemostream::edge::config::Config;
+use hemostream::edge::config::{Config, Timing};
 use hemostream::edge::files::csv::{EventWriter, TableWriter, beat_header, beat_row, estimate_header, estimate_row};
 use hemostream::edge::files::record::Record;
 use hemostream::edge::outlet::notice_text;
@@ -65,6 +65,11 @@ impl Estimate {
         let Some(input) = self.record.as_ref().or(self.input.as_ref()) else {
             return Err(Failure::Input("found no record, expected INPUT or --record".to_owned()));
         };
+        if config.estimator.timing == Timing::Beats {
+            let message =
+                "`estimator.timing`: found \"beats\", which no record has, expected \"config\" or \"tracked\"";
+            return Err(Failure::Input(message.to_owned()));
+        }
         let workers = Workers::start(self.threads.unwrap_or(config.service.workers)).map_err(failed)?;
         // Read it to the end once: a bad cell is reported before anything is computed or written.
         let seconds = check_record(input, &config)?;

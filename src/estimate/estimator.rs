@@ -184,8 +184,8 @@ impl<M: Model> Estimator<M> {
             Input::Beats(onsets) => {
                 self.told.extend(onsets);
                 self.told.sort_unstable();
-                let excess = self.told.len().saturating_sub(MAX_TOLD);
-                self.told.drain(..excess);
+                // The first are needed first.
+                self.told.truncate(MAX_TOLD);
             }
         }
         let ended = self.cutter.has_ended();
@@ -200,8 +200,19 @@ impl<M: Model> Estimator<M> {
             self.cutter.restart(now);
         }
         if ended {
-            self.put_out_smoothed(EventTime(i64::MAX), out);
+            self.put_out_the_rest(out);
         }
+    }
+
+    /// What was kept back because more might become known of it.
+    fn put_out_the_rest(&mut self, out: &mut Vec<Output>) {
+        self.put_out_smoothed(EventTime(i64::MAX), out);
+        self.put_out_beats(true, out);
+    }
+
+    fn put_out_beats(&mut self, last: bool, out: &mut Vec<Output>) {
+        let beats = self.ensemble.iter_mut().flat_map(|ensemble| ensemble.take_beats(last));
+        out.extend(beats.map(Output::Beat));
     }
 
     fn take(&mut self, channel: usize, samples: &[RawSample], now: ArrivalTime, out: &mut Vec<Output>) {
@@ -209,6 +220,7 @@ impl<M: Model> Estimator<M> {
         self.report(channel, &ingested, now, out);
         if ingested.clock_changed {
             self.start_anew(out);
+            self.told.clear();
             let dropped = self.cutter.clear(now) as u64;
             if dropped > 0 {
                 *self.refused.entry(Refusal::ClockJump).or_default() += dropped;
@@ -239,6 +251,7 @@ impl<M: Model> Estimator<M> {
     }
 
     fn start_anew(&mut self, out: &mut Vec<Output>) {
+        self.put_out_the_rest(out);
         if self.ensemble.take().is_some() {
             self.restarts += 1;
             out.push(notice(self.time(), NoticeKind::Restart, None));
@@ -292,12 +305,13 @@ impl<M: Model> Estimator<M> {
             }
             self.calm_since[k] = window.end;
         }
-        self.tally(window.end, &observations, &report, out);
+        // Before the beat is found, samples are listened to but nothing is learnt of them.
+        let learnt: &[Observation] = if self.tracker.is_acquired() { &observations } else { &[] };
+        self.tally(window.end, learnt, &report, out);
         self.keep_time(window, &observations, &report, parallel, out);
-        self.publish(window, &observations, first, out);
-        let beats = self.ensemble.iter_mut().flat_map(Ensemble::take_beats);
-        out.extend(beats.map(Output::Beat));
-        let samples = observations.len();
+        self.publish(window, learnt, first, out);
+        self.put_out_beats(false, out);
+        let samples = learnt.len();
         out.push(Output::Window(WindowDone { end: window.end, closed_at: window.closed_at, samples, report }));
     }
 
@@ -364,7 +378,7 @@ impl<M: Model> Estimator<M> {
             }
         }
         // What a rhythm in doubt makes of the pressures says nothing about resistances.
-        ensemble.hold_parameters(self.settings.live.timing == TimingSource::Found && self.tracker.is_in_doubt());
+        ensemble.hold_parameters(self.tracker.is_in_doubt());
         if !found.edits.is_empty() {
             ensemble.edit_clocks(&found.edits, clock.time_s, parallel);
         }

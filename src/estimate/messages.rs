@@ -98,7 +98,7 @@ pub enum NoticeKind {
     NotUnderstood(&'static str),
     /// Started anew after a silence too long to bridge or a jump of the sender's clock.
     Restart,
-    /// Members that lost their numbers were replaced by draws from the others.
+    /// Members that lost their numbers were replaced by copies of others.
     MembersReplaced(usize),
     /// No member of a window could be solved; the ensemble stays where it was.
     WindowFailed,
@@ -160,7 +160,7 @@ impl NoticeKind {
             Self::Misfit => "the model no longer says what this sensor reads, beat after beat; bands widen".to_owned(),
             Self::FitsAgain => "the model says again what this sensor reads".to_owned(),
             Self::ParameterShift(_) => "a parameter has begun to move".to_owned(),
-            Self::BeatFound => "the beat was found in the pressures".to_owned(),
+            Self::BeatFound => "the beat was found".to_owned(),
             Self::BeatMissed => "no beat came when one was due; the clock waits".to_owned(),
             Self::BeatUnexpected => "a beat came at an unexpected time; the clock was set".to_owned(),
         }
@@ -182,9 +182,9 @@ pub struct ChannelHealth {
     pub innovation_rms: f64,
     /// Noise that it is taken to have \[mmHg\].
     pub noise_sd_mmhg: f64,
-    /// See [`ChannelFit::whiteness`].
+    /// See [`ChannelFit::whiteness`](super::adapt::fit::ChannelFit::whiteness).
     pub whiteness: f64,
-    /// See [`ChannelFit::recurrence`].
+    /// See [`ChannelFit::recurrence`](super::adapt::fit::ChannelFit::recurrence).
     pub recurrence: f64,
     /// Why it is set aside, if it is.
     pub artefact: Option<Artefact>,

@@ -29,7 +29,7 @@
 //!    a centre, pace and pull are a statement of the user and stay.
 //! 2. *How noisy a sensor is* shows in the differences of neighbouring innovations, whatever the model does.
 //! 3. *Whether the model fits* shows in innovations that agree with their neighbours, or that come back with every beat
-//!    ([`adapt::fit`]). The first adds process noise to what the sensor observes, and some to the rest; the second widens
+//!    ([`adapt::fit`]). The first adds process noise to what the sensor observes, and some to the other sensors'; the second widens
 //!    the model's part of that channel's band by what is missed, phase by phase. Past a limit it is a misfit, which is said.
 //! 4. *A single sample that is far off* pulls no harder than one that is just credible (Huber); a sensor that is
 //!    disturbed is set aside ([`signal::quality`]) and its channel is forecast meanwhile.

@@ -11,6 +11,12 @@ use super::signal::onset::{OnsetDetector, OnsetSettings, RateTracker, Recent};
 /// Error of the clock that the ensemble is not left alone with \[beats\].
 const SURPRISE: f64 = 0.05;
 
+/// Less is no error of the clock \[beats\].
+const TINY: f64 = 0.005;
+
+/// An interval so many times longer than the last is that of more than one beat.
+const MISSED: f64 = 1.8;
+
 /// Share of the beat by which an onset may be late before it is missed, and what a detector needs to report it \[s\].
 const LATE: f64 = 0.15;
 const LATENCY_S: f64 = 0.13;
@@ -45,6 +51,8 @@ pub enum ClockEdit {
         at_s: f64,
         /// Heart rate from here on \[1/min\], if it changed.
         rate: Option<f64>,
+        /// Whether the beat that the clock counted last was a real one, so that this is another, however early.
+        another: bool,
     },
     /// No beat came where one was due: the clock waits from here on.
     Wait {
@@ -155,10 +163,11 @@ impl BeatTracker {
         self.acquired
     }
 
-    /// Whether the rhythm is in doubt: a beat came unexpectedly or not at all, and none has come as expected since.
+    /// Whether the rhythm is in doubt: a beat did not come, or came unexpectedly and none has come as expected since (one
+    /// that is told is not unexpected).
     #[must_use]
     pub fn is_in_doubt(&self) -> bool {
-        self.waiting || self.surprises > 0
+        self.waiting || (self.source == TimingSource::Found && self.surprises > 0)
     }
 
     /// Takes the beats told from outside up to the end of a window.
@@ -168,7 +177,8 @@ impl BeatTracker {
             self.beat(at_s, clock, true, &mut found);
         }
         let phase = clock.beats - clock.beats.floor();
-        if self.source == TimingSource::Told && !self.waiting && onsets_s.is_empty() && phase >= WAITING_PHASE {
+        let is_due = self.source == TimingSource::Told && self.acquired && onsets_s.is_empty();
+        if is_due && !self.waiting && phase >= WAITING_PHASE {
             self.waiting = true;
             found.edits.push(ClockEdit::Wait { from_s: clock.time_s });
         }
@@ -209,14 +219,14 @@ impl BeatTracker {
     }
 
     fn beat(&mut self, at_s: f64, clock: ClockReading, certain: bool, found: &mut Found) {
-        let interval_s = self.last_beat_s.map(|last| at_s - last);
-        self.last_beat_s = Some(at_s);
+        let last_beat_s = self.last_beat_s.replace(at_s);
+        let interval_s = last_beat_s.map(|last| at_s - last);
         if !self.acquired {
             let interval_s = if certain { interval_s } else { self.rate.interval_s() };
             if let Some(interval_s) = interval_s.filter(|interval_s| *interval_s > 0.0) {
                 self.acquired = true;
                 found.acquired = true;
-                found.edits.push(ClockEdit::Beat { at_s, rate: Some(60.0 / interval_s) });
+                found.edits.push(ClockEdit::Beat { at_s, rate: Some(60.0 / interval_s), another: false });
             }
             self.last_interval_s = interval_s;
             return;
@@ -224,14 +234,23 @@ impl BeatTracker {
         let beats = clock.beats_at(at_s);
         let error = beats - beats.round();
         if certain || self.waiting || error.abs() > SURPRISE {
+            let counted_last = |last_s: f64| (clock.beats_at(last_s) - beats.floor()).abs() < 0.25;
+            let another = error > 0.0 && !self.waiting && last_beat_s.is_some_and(counted_last);
+            if error > TINY && !another && !self.waiting {
+                // The clock went on to a beat that had not come yet: it should have waited.
+                let from_s = at_s - (error + 1.0 - WAITING_PHASE) / clock.rate_hz;
+                found.edits.push(ClockEdit::Wait { from_s });
+            }
             let same = |(a, b): (f64, f64)| (a / b - 1.0).abs() < SAME_RHYTHM;
             let rhythm = interval_s.zip(self.last_interval_s).filter(|pair| same(*pair));
             let changed = if certain {
-                interval_s.filter(|interval_s| *interval_s > 0.0).map(|interval_s| 60.0 / interval_s)
+                // After one that was not told, the interval is that of two.
+                let usual = |interval_s: &f64| self.last_interval_s.is_none_or(|last| *interval_s < MISSED * last);
+                interval_s.filter(|interval_s| *interval_s > 0.0).filter(usual).map(|interval_s| 60.0 / interval_s)
             } else {
                 rhythm.filter(|_| self.surprises > 0).map(|(now, before)| 120.0 / (now + before))
             };
-            found.edits.push(ClockEdit::Beat { at_s, rate: changed });
+            found.edits.push(ClockEdit::Beat { at_s, rate: changed, another });
             found.surprised |= !certain;
             self.surprises += 1;
             self.waiting = false;

@@ -11,8 +11,8 @@ use super::keys::{self, KeyPath};
 use super::layers::Stack;
 use super::patient::{InitialSd, Patient, ScriptEntry};
 use super::schema::{
-    Config, Coupling, DiscrepancyForm, Distribution, EstimatorSettings, PriorSettings, PublishSettings, Timing,
-    WindowSettings,
+    Config, Coupling, DiscrepancyForm, Distribution, EstimatorSettings, PriorSettings, PublishSettings, SecondOpinion,
+    Timing, WindowSettings,
 };
 use crate::model::cvsim6::{Cvsim6, PARAMETERS, Pressures};
 use crate::model::{Model, ParameterInfo};
@@ -267,6 +267,10 @@ impl Checker {
         if let Some(name) = name.filter(|_| needs_coupled) {
             let expected = "expected \"coupled\" where beats are followed or estimates looked back at";
             self.refuse("estimator.coupling", format!("found \"{name}\", {expected}"));
+        }
+        if estimator.second_opinion != SecondOpinion::None && estimator.timing != Timing::Config {
+            let message = "found a filter, expected \"none\" where beats are followed: filters keep to their own clock";
+            self.refuse_against("estimator.second_opinion", "estimator.timing", message.to_owned());
         }
         self.whole("estimator.max_iterations", estimator.max_iterations, 1..=100);
         let fraction = (Bound::Excluded(0.0), Bound::Excluded(1.0));

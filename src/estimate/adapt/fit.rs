@@ -1,9 +1,9 @@
 //! Whether sensors and model do what the settings say, channel by channel.
 //!
-//! With the right model the normalised innovations of a channel are white with variance 1. Two things are told apart:
-//! noise that is larger or smaller than stated shows in the differences of neighbouring innovations; a model that does
-//! not fit shows in innovations that agree with their neighbours, so that their sum over a tenth of a second is larger
-//! than it should be.
+//! With the right model the normalised innovations of a channel are white with variance 1. Three things are told apart:
+//! noise that is larger or smaller than stated shows in the differences of neighbouring innovations; a state that does
+//! what the model does not say, in innovations that agree with their neighbours, so that their sum over a moment or half
+//! a beat is larger than it should be; a model that does not fit, in innovations that come back with every beat.
 
 /// Stretches over which innovations are summed up \[s\], and how many there must be in each: what a model misses may
 /// last for a moment or for half a beat.
@@ -47,6 +47,8 @@ const SYSTEMATIC: f64 = 1.4;
 const MISFIT_RECURRENCE: f64 = 3.0;
 /// Nor does it where so much extra noise is needed, and what it covers comes back with the beat (if there is one): with
 /// the right model it is now and then asked for by accident, for some seconds.
+///
+/// Where much process noise was stated from the start (`pressure_drift` above 0.03), so much more is never asked for.
 const MISFIT_EXCESS: f64 = 300.0;
 
 /// Innovations of one phase of the beat.
@@ -200,7 +202,8 @@ impl ChannelFit {
 
     fn hear_phase(&mut self, phase: f64, innovation: f64) {
         let now = bin(phase);
-        if now < self.phase {
+        // Not where the clock was only set back a little.
+        if now + PHASES / 2 < self.phase {
             for phase in &mut self.phases {
                 phase.sum *= KEPT_PER_BEAT;
                 phase.weight *= KEPT_PER_BEAT;

@@ -1,8 +1,10 @@
 //! The beats of the members, right also where windows are solved again by another clock.
 
+use super::review::REMEMBERED_S;
 use super::{Ensemble, Snapshot};
 use crate::estimate::beat::{BeatEstimate, BeatFollower};
-use crate::estimate::time::EventTime;
+use crate::estimate::time::{EventTime, ns_from_s};
+use crate::estimate::timing::TimingSource;
 use crate::model::Model;
 
 /// What is known of the beat under way.
@@ -12,10 +14,18 @@ pub(super) struct Beats {
     pub(super) follower: BeatFollower,
     /// End of the last window.
     pub(super) end: EventTime,
+    /// Beats that are over and not told yet.
+    over: Vec<BeatEstimate>,
     /// A beat that began before was told already.
     told_to: EventTime,
-    over: Vec<BeatEstimate>,
     scratch: Snapshot,
+}
+
+impl Beats {
+    /// Forgets what ended after `time`, which is looked at again.
+    pub(super) fn take_back(&mut self, time: EventTime) {
+        self.over.retain(|beat| beat.end <= time);
+    }
 }
 
 impl<M: Model> Ensemble<M> {
@@ -24,15 +34,25 @@ impl<M: Model> Ensemble<M> {
         self.beats = Some(Beats {
             follower: BeatFollower::default(),
             end: start,
-            told_to: EventTime(i64::MIN),
             over: Vec::new(),
+            told_to: EventTime(i64::MIN),
             scratch: Snapshot::default(),
         });
     }
 
-    /// Beats that are over and were not told yet.
-    pub fn take_beats(&mut self) -> Vec<BeatEstimate> {
-        self.beats.as_mut().map(|beats| std::mem::take(&mut beats.over)).unwrap_or_default()
+    /// Beats that are over and were not told yet. Where clocks may be set in what was solved already, a beat is told when
+    /// that can no longer happen to it, or when this is the `last` time.
+    pub fn take_beats(&mut self, last: bool) -> Vec<BeatEstimate> {
+        let may_change = self.settings.live.timing != TimingSource::Clock && !last;
+        let Some(beats) = &mut self.beats else { return Vec::new() };
+        let settled = if may_change { beats.end.plus_ns(-ns_from_s(REMEMBERED_S)) } else { beats.end };
+        let (now, later): (Vec<_>, Vec<_>) = beats.over.drain(..).partition(|beat| beat.end <= settled);
+        beats.over = later;
+        if let Some(beat) = now.last() {
+            // Half a beat: what is found again in a second look begins a little earlier or later.
+            beats.told_to = beat.start.plus_ns(beat.end.ns_since(beat.start) / 2);
+        }
+        now
     }
 
     /// Takes in the window that was just solved.
@@ -44,11 +64,7 @@ impl<M: Model> Ensemble<M> {
             Some(clock) if self.listening => {
                 let values = self.snapshot(1.0, &mut beats.scratch);
                 let over = beats.follower.follow(&self.model, beats.end, clock, values, &|i| self.theta_of(i));
-                if let Some(beat) = over.filter(|beat| beat.start >= beats.told_to) {
-                    // Half a beat: what is told again after a second look begins a little earlier or later.
-                    beats.told_to = beat.start.plus_ns(beat.end.ns_since(beat.start) / 2);
-                    beats.over.push(beat);
-                }
+                beats.over.extend(over.filter(|beat| beat.start >= beats.told_to));
             }
             _ => beats.follower = BeatFollower::default(),
         }

@@ -13,6 +13,16 @@ const RATE_SD: f64 = 0.03;
 
 const PHASE_SD: f64 = 0.01;
 
+/// Something to be done with the clocks, on the clock of `elapsed_s`.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Edit {
+    /// When it takes effect: when it happened, or as soon as it was known.
+    due_s: f64,
+    /// When it happened.
+    at_s: f64,
+    what: ClockEdit,
+}
+
 impl<M: Model> Ensemble<M> {
     /// Sets the clocks of the members; `now_s` is the event time at the end of the last window.
     pub fn edit_clocks(&mut self, edits: &[ClockEdit], now_s: f64, parallel: &dyn Parallel) {
@@ -21,14 +31,17 @@ impl<M: Model> Ensemble<M> {
             ClockEdit::Wait { from_s } => now_s - from_s,
             ClockEdit::GoOn => 0.0,
         };
-        self.edits = edits.iter().map(|edit| (self.elapsed_s - ago(edit), *edit)).collect();
-        if let Some((earliest, _)) = self.edits.first() {
+        let since_start = |edit: &ClockEdit| {
+            let at_s = self.elapsed_s - ago(edit);
+            Edit { due_s: at_s, at_s, what: *edit }
+        };
+        self.edits = edits.iter().map(since_start).collect();
+        if let Some(earliest) = self.edits.first() {
             // Before the clock went wrong, parameters had no reason to move: their paces start again from there, too.
-            self.look_again(*earliest, true, parallel);
+            self.look_again(earliest.at_s, true, parallel);
         }
         // What lies in the present, or could not be remembered.
-        let h = self.settings.window.length_s();
-        self.apply_edits(f64::INFINITY, self.elapsed_s - h);
+        self.apply_edits(f64::INFINITY, self.elapsed_s);
         if !self.listening {
             self.spread_anew();
         }
@@ -46,10 +59,14 @@ impl<M: Model> Ensemble<M> {
 
     /// Applies what falls before `until_s`; clocks stand at `start_s`.
     pub(super) fn apply_edits(&mut self, until_s: f64, start_s: f64) {
-        while let Some((at_s, edit)) = self.edits.first().copied().filter(|(at_s, _)| *at_s < until_s) {
-            self.edits.remove(0);
-            match edit {
-                ClockEdit::Beat { rate, .. } => self.begin_beat(at_s.max(start_s - MAX_CLOCK_S) - start_s, rate),
+        while self.edits.first().is_some_and(|edit| edit.due_s < until_s) {
+            let Edit { due_s, at_s, what } = self.edits.remove(0);
+            self.applied.retain(|edit| edit.due_s >= start_s - MAX_CLOCK_S);
+            self.applied.push(Edit { due_s: due_s.max(start_s), at_s, what });
+            match what {
+                ClockEdit::Beat { rate, another, .. } => {
+                    self.begin_beat(at_s.max(start_s - MAX_CLOCK_S) - start_s, rate, another);
+                }
                 ClockEdit::Wait { .. } => {
                     self.clock_waits = true;
                     self.shift_clocks(|beats| beats.round() - 1.0 + WAITING_PHASE);
@@ -59,8 +76,18 @@ impl<M: Model> Ensemble<M> {
         }
     }
 
-    /// A beat begins `ahead_s` from where the clocks stand.
-    fn begin_beat(&mut self, ahead_s: f64, rate: Option<f64>) {
+    /// What was applied from `from_s` on is to be applied again.
+    pub(super) fn take_back_edits(&mut self, from_s: f64) {
+        let (mut again, before): (Vec<Edit>, Vec<Edit>) = self.applied.drain(..).partition(|edit| edit.due_s >= from_s);
+        self.applied = before;
+        again.append(&mut self.edits);
+        // Stable: of two at the same time, the one that was known first comes first.
+        again.sort_by(|a, b| a.due_s.total_cmp(&b.due_s));
+        self.edits = again;
+    }
+
+    /// A beat begins `ahead_s` from where the clocks stand; `another` than the one that they counted last.
+    fn begin_beat(&mut self, ahead_s: f64, rate: Option<f64>, another: bool) {
         let Some(cycle) = self.model.cycle() else { return };
         self.clock_waits = false;
         let m = self.members.len();
@@ -75,7 +102,8 @@ impl<M: Model> Ensemble<M> {
         }
         let per_s = self.rate_hz().unwrap_or(0.0);
         let beats = self.cycles().unwrap_or(0.0);
-        let target = (beats + ahead_s * per_s).round() - ahead_s * per_s;
+        let there = beats + ahead_s * per_s;
+        let target = if another { there.ceil() } else { there.round() } - ahead_s * per_s;
         for (member, e) in self.members.iter_mut().zip(&draws[m..]) {
             // A new rhythm leaves nothing of what the members thought of the old one.
             let own = if rate.is_some() { 0.0 } else { member.theta[cycle.phase] - beats };

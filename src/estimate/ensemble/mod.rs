@@ -11,6 +11,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
 use self::beats::Beats;
+use self::clock::Edit;
 use self::review::Memory;
 pub use self::setup::with_companions;
 use self::setup::{channel_fit, check, draw_bases};
@@ -24,7 +25,6 @@ use super::rivals::Unscented;
 use super::settings::{CouplingKind, EstimatorSettings, SettingsError};
 use super::smoother::Smoother;
 use super::statistics::mean_and_sd;
-use super::timing::ClockEdit;
 use crate::model::{Model, Transform};
 use crate::xtfc::problem::{Solution, Unknowns};
 
@@ -71,7 +71,7 @@ pub struct Observation {
 pub struct WindowReport {
     /// Members whose solve gave numbers.
     pub solved: usize,
-    /// Members replaced by a draw from the others because theirs did not.
+    /// Members replaced by copies of others because theirs did not.
     pub replaced: usize,
     /// Members whose iteration did not converge (but gave numbers).
     pub not_converged: usize,
@@ -126,8 +126,9 @@ pub struct Ensemble<M> {
     listening: bool,
     held: bool,
     clock_waits: bool,
-    /// When on the clock of `elapsed_s`, and what; in order of time.
-    edits: Vec<(f64, ClockEdit)>,
+    /// In order of time: those to come, and those of the last moments.
+    edits: Vec<Edit>,
+    applied: Vec<Edit>,
     beats: Option<Beats>,
 }
 
@@ -199,6 +200,7 @@ impl<M: Model> Ensemble<M> {
             held: false,
             clock_waits: false,
             edits: Vec::new(),
+            applied: Vec::new(),
             beats: None,
         };
         ensemble.initial_sd = (0..ensemble.estimated.len()).map(|k| ensemble.coordinate(k).1).collect();
@@ -434,7 +436,7 @@ impl<M: Model> Ensemble<M> {
             .collect()
     }
 
-    /// Gives a failed member the place of a living one, with the spread of the living around it.
+    /// Gives a failed member the place of a living one, and its features.
     fn replace_failed(&mut self) -> usize {
         let living: Vec<usize> = (0..self.members.len()).filter(|&i| self.members[i].solved).collect();
         if living.len() == self.members.len() || living.is_empty() {

@@ -15,6 +15,9 @@ const CHECKPOINT_S: f64 = 0.1;
 
 const CHECKPOINTS: usize = 8;
 
+/// Nothing is looked at again after this time \[s\].
+pub(super) const REMEMBERED_S: f64 = 0.9;
+
 /// How far a second look goes back when a parameter has begun to move \[s\].
 const LOOK_BACK_S: f64 = 0.4;
 
@@ -112,6 +115,7 @@ impl<M: Model> Ensemble<M> {
         let Some((checkpoint, windows)) = self.memory.rewind(from_s) else { return };
         let h = self.settings.window.length_s();
         self.restore(&checkpoint);
+        self.take_back_edits(checkpoint.elapsed_s);
         if doubt {
             self.paces.clone_from(&checkpoint.paces);
         }
@@ -160,6 +164,7 @@ impl<M: Model> Ensemble<M> {
         if let Some((beats, (follower, end))) = self.beats.as_mut().zip(checkpoint.beat.as_ref()) {
             beats.follower.clone_from(follower);
             beats.end = *end;
+            beats.take_back(*end);
         }
     }
 }

@@ -7,8 +7,8 @@ use crate::estimate::statistics::{Explainers, Summary, mean_and_sd, summarise};
 use crate::estimate::time::EventTime;
 use crate::model::Model;
 
-/// A parameter is identifiable when data have halved the sd it started with.
-const IDENTIFIABLE: f64 = 0.75;
+/// A parameter is identifiable when data have brought its sd to less than a third of that it started with.
+const IDENTIFIABLE: f64 = 0.9;
 
 /// An estimated parameter.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -59,15 +59,15 @@ impl<M: Model> Ensemble<M> {
 
     /// One summary per quantity of [`Ensemble::snapshot`].
     pub fn summarise_at(&self, s: f64, scratch: &mut Snapshot) -> Vec<Summary> {
-        self.summarise(self.snapshot(s, scratch))
+        self.summarise(self.snapshot(s, scratch), self.cycles())
     }
 
-    /// One summary per row of `values` `[n_quantities x n_members]`, states first.
-    fn summarise(&self, values: &mut [f64]) -> Vec<Summary> {
+    /// One summary per row of `values` `[n_quantities x n_members]`, states first, where the clock says `cycles`.
+    fn summarise(&self, values: &mut [f64], cycles: Option<f64>) -> Vec<Summary> {
         let (n, m) = (self.model.n_states(), self.members.len());
         let explainers = Explainers::new(&values[(n - self.model.n_discrepancies()) * m..n * m], m);
         let noise = |q: usize| self.settings.aleatoric_sd_mmhg.get(q).copied().unwrap_or(0.0);
-        let phase = self.cycles().map(|cycles| cycles.rem_euclid(1.0));
+        let phase = cycles.map(|cycles| cycles.rem_euclid(1.0));
         let systematic = |q: usize| {
             let own = self.settings.channels.iter().position(|c| c.state == q);
             own.map_or(0.0, |channel| self.fits[channel].systematic_sd(phase))
@@ -162,6 +162,10 @@ impl<M: Model> Ensemble<M> {
             self.parameter_summary(k, row, mean_and_sd(&coordinates).1)
         });
         let summaries = summaries.collect();
-        Some((moment.time, self.summarise(&mut values), summaries))
+        let cycles = self.model.cycle().map(|cycle| {
+            let own = self.estimated.iter().position(|&p| p == cycle.phase);
+            own.map_or(moment.theta[cycle.phase], |k| mean_and_sd(&parameters[k * m..(k + 1) * m]).0)
+        });
+        Some((moment.time, self.summarise(&mut values, cycles), summaries))
     }
 }

@@ -202,7 +202,7 @@ fn draw_panels(buf: &mut Buffer, area: Rect, (bed, at): (&Bed, Duration), ward: 
     let rest = area.height - one_each;
     let values = if rest >= panels::VALUE_ROWS + LEAST_HEALTH { panels::VALUE_ROWS } else { 0 };
     let has_room = rest >= values + panels::BEAT_ROWS + health_rows;
-    let beat = if has_room && !bed.beat.is_empty() { panels::BEAT_ROWS } else { 0 };
+    let beat = if has_room && bed.has_beats() { panels::BEAT_ROWS } else { 0 };
     let spare = rest.saturating_sub(beat + values + health_rows);
     let fits = |rows: &u16| panels::parameter_rows(bed, *rows) <= one_each + spare;
     let rows_each = MORE_ROWS_PER_PARAMETER.into_iter().find(fits).unwrap_or(1);

@@ -23,6 +23,9 @@ pub(super) const STALE_AFTER: Duration = Duration::from_secs(2);
 /// An estimate this long without data is called a forecast \[s\].
 pub(super) const FORECAST_AFTER_S: f64 = 0.25;
 
+/// A beat that ended longer ago is not the present one.
+const PRESENT_BEAT_NS: i64 = 4 * NS_PER_S;
+
 /// Longest past of the waveforms \[s\].
 pub(super) const HISTORY_S: i64 = 60;
 const NS_PER_S: i64 = 1_000_000_000;
@@ -137,8 +140,8 @@ pub(super) struct Bed {
     pub(super) truth: History<[f32; QUANTITIES]>,
     pub(super) true_parameters: BTreeMap<&'static str, f64>,
     pub(super) parameters: Vec<Parameter>,
-    /// Of the last beat that was over.
-    pub(super) beat: Vec<BeatReading>,
+    /// Of the last beat that was over, and when it was \[ns\].
+    beat: (i64, Vec<BeatReading>),
     pub(super) status: Option<Status>,
     pub(super) events: VecDeque<EventLine>,
     estimate_arrival: Option<Duration>,
@@ -370,12 +373,20 @@ impl Bed {
             unit: tame(unit, MAX_NAME),
             band: Band::from_row(&BEAT_STATISTICS, row),
         };
-        self.beat = rows.take(MAX_PARAMETERS).map(reading).collect();
+        self.beat = (beat.end_ns, rows.take(MAX_PARAMETERS).map(reading).collect());
     }
 
-    /// A clinical quantity of the last beat.
+    /// A clinical quantity of the last beat, unless that was long ago: what does not beat has no output.
     pub(super) fn of_beat(&self, name: &str) -> Option<&BeatReading> {
-        self.beat.iter().find(|reading| reading.name == name)
+        let (end_ns, readings) = &self.beat;
+        let is_present = |now_ns: &i64| now_ns.saturating_sub(*end_ns) <= PRESENT_BEAT_NS;
+        self.history.newest_ns().filter(is_present)?;
+        readings.iter().find(|reading| reading.name == name)
+    }
+
+    /// Whether beats are told.
+    pub(super) fn has_beats(&self) -> bool {
+        !self.beat.1.is_empty()
     }
 
     fn take_truth(&mut self, truth: &Truth, limits: Limits) {
