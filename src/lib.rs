@@ -30,6 +30,7 @@
 //! | | |
 //! |---|---|
 //! | a model | one file in [`model`]; [`model::adding_a_model`] is the recipe |
+//! | equations of a model for eight members at once | [`model::lanes::LaneModel`], and [`model::Model::lanes`] |
 //! | something that a model may lack | a `delta_...` parameter of it, see [`model::discrepancy`] |
 //! | an activation, a distribution, a node placement | [`xtfc::features`], and its name in [`edge::config`] |
 //! | another way to couple members | [`estimate::coupling`] |

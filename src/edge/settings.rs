@@ -153,6 +153,7 @@ impl Config {
                 Adaptation::OFF
             },
             stopping: Stopping { max_iterations: estimator.max_iterations, tolerance_mmhg: estimator.tolerance },
+            instructions: self.service.instruction_set.set(),
             channels: self.observed_channels(),
             aleatoric_sd_mmhg: with(self.channels.iter().map(|(_, c)| c.noise_sd).collect(), &|_| 0.0),
             live: LiveSettings {

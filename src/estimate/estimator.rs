@@ -57,7 +57,7 @@ impl ChannelTally {
 
 /// The estimator of one bed.
 #[derive(Debug, Clone)]
-pub struct Estimator<M> {
+pub struct Estimator<M: Model> {
     model: M,
     settings: EstimatorSettings,
     cutter: WindowCutter,

@@ -142,6 +142,17 @@ impl Member {
         }
     }
 
+    /// A window that nothing is learnt from, by the general solver.
+    pub(super) fn solve_without_samples<M: Model>(
+        &mut self,
+        model: &M,
+        settings: &EstimatorSettings,
+        unknowns: &Unknowns,
+    ) {
+        self.data.clear();
+        self.solve(model, settings, unknowns, &[]);
+    }
+
     /// Where it was at the start of the window and is at its end, in a filter that has no network between them.
     pub(super) fn go<M: Model>(&mut self, model: &M, h: f64, end: &[f64]) {
         std::mem::swap(&mut self.solution.start, &mut self.x);
@@ -155,7 +166,9 @@ impl Member {
 
     /// State at position `s` of the window.
     pub(super) fn state_at<M: Model>(&self, model: &M, s: f64, phi: &mut Vec<f64>, out: &mut [f64]) {
-        if let Some(basis) = &self.basis {
+        if s >= 1.0 {
+            out.copy_from_slice(&self.solution.end);
+        } else if let Some(basis) = &self.basis {
             phi.resize(basis.rank(), 0.0);
             self.solution.state_at(model, basis, s, phi, out);
         } else {

@@ -3,6 +3,7 @@
 
 use super::time::s_from_ns;
 use super::timing::TimingSource;
+use crate::model::lanes::InstructionSet;
 use crate::model::{Model, ParameterInfo, Transform};
 use crate::xtfc::features::FeatureSpec;
 use crate::xtfc::problem::Stopping;
@@ -186,6 +187,8 @@ pub struct EstimatorSettings {
     pub adaptation: Adaptation,
     /// When a member's iteration stops.
     pub stopping: Stopping,
+    /// What kernels run on; the results are the same on each.
+    pub instructions: InstructionSet,
     /// Sensors listened to.
     pub channels: Vec<ChannelSettings>,
     /// Sensor noise by state \[mmHg\], whether listened to or not; 0 where unknown. `[n_states]`.

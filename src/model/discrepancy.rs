@@ -145,6 +145,13 @@ impl<M: Model> Discrepant<M> {
 }
 
 impl<M: Model> Model for Discrepant<M> {
+    type Lanes = M::Lanes;
+
+    fn lanes(&self) -> Option<Self::Lanes> {
+        // With something that it lacks it has more states than the equations for lanes.
+        if self.terms.is_empty() { self.base.lanes() } else { None }
+    }
+
     fn states(&self) -> &[Quantity] {
         &self.states
     }

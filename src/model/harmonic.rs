@@ -91,6 +91,8 @@ impl Harmonic {
 }
 
 impl Model for Harmonic {
+    type Lanes = super::lanes::NoLanes;
+
     fn states(&self) -> &[Quantity] {
         STATES
     }

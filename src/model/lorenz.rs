@@ -82,6 +82,8 @@ impl Lorenz {
 }
 
 impl Model for Lorenz {
+    type Lanes = super::lanes::NoLanes;
+
     fn states(&self) -> &[Quantity] {
         STATES
     }

@@ -13,6 +13,7 @@ pub mod capacitance;
 pub mod cvsim6;
 pub mod discrepancy;
 pub mod harmonic;
+pub mod lanes;
 pub mod lorenz;
 pub mod oscillator;
 pub mod rk4;
@@ -196,6 +197,9 @@ impl Extent {
 /// (the phase of the heart beat, absolute time) is a *clock parameter*: an entry of `theta` that
 /// [`Model::advance`] moves on.
 pub trait Model: Clone + Send + Sync + 'static {
+    /// Its equations for eight members at once; [`lanes::NoLanes`] if there are none.
+    type Lanes: lanes::LaneModel;
+
     /// The states, in order.
     fn states(&self) -> &[Quantity];
 
@@ -234,6 +238,11 @@ pub trait Model: Clone + Send + Sync + 'static {
         if let Some(cycle) = self.cycle() {
             theta[cycle.phase] = phase;
         }
+    }
+
+    /// The equations for eight members at once; without them, members are solved one by one.
+    fn lanes(&self) -> Option<Self::Lanes> {
+        None
     }
 
     /// What makes it periodic, if anything does.

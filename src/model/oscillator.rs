@@ -58,6 +58,8 @@ pub struct Oscillator {
 }
 
 impl Model for Oscillator {
+    type Lanes = super::lanes::NoLanes;
+
     fn states(&self) -> &[Quantity] {
         STATES
     }

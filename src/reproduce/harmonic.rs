@@ -120,6 +120,7 @@ impl Setup {
             adaptation: Adaptation::OFF,
             live: LiveSettings::default(),
             stopping: Stopping { max_iterations: 50, tolerance_mmhg: 1e-6 },
+            instructions: crate::model::lanes::InstructionSet::default(),
             channels: vec![ChannelSettings {
                 state: 0,
                 noise_sd_mmhg: self.noise_sd,

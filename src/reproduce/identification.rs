@@ -245,6 +245,7 @@ impl<M: Model> Task<'_, M> {
             adaptation: Adaptation::OFF,
             live: LiveSettings::default(),
             stopping: Stopping { max_iterations: 50, tolerance_mmhg: 1e-8 },
+            instructions: crate::model::lanes::InstructionSet::default(),
             channels: (0..n).map(channel).collect(),
             aleatoric_sd_mmhg: padded(vec![self.noise_sd; n], 0.0),
             publish_period_ns: NS_PER_S,

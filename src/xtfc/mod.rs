@@ -7,6 +7,7 @@
 //! | [`problem`] | unknowns, priors, rows: what is minimised |
 //! | [`dense`] | general solver: Gauss-Newton on dense least squares, any shape; the readable reference |
 //! | [`collocation`] | the same minimiser when there are as many features as nodes, several times cheaper |
+//! | [`sweeps`] | the same without samples, for eight members at once |
 //!
 //! Invariants: a pure function of the problem; a failed solve is a value with an account of itself.
 //! Deliberately absent: ensembles, random draws other than the features, event time, channels.
@@ -17,3 +18,4 @@ pub mod dense;
 pub mod features;
 mod lu;
 pub mod problem;
+pub mod sweeps;

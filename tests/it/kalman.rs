@@ -28,6 +28,8 @@ const PARAMETERS: &[ParameterInfo] = &[ParameterInfo {
 }];
 
 impl Model for Linear {
+    type Lanes = hemostream::model::lanes::NoLanes;
+
     fn states(&self) -> &[Quantity] {
         STATES
     }
@@ -84,6 +86,7 @@ fn settings(members: usize) -> EstimatorSettings {
         adaptation: Adaptation::OFF,
         live: LiveSettings::default(),
         stopping: Stopping::default(),
+        instructions: hemostream::model::lanes::InstructionSet::default(),
         channels: vec![ChannelSettings { state: 0, noise_sd_mmhg: NOISE, plausible_mmhg: (-1e3, 1e3) }],
         aleatoric_sd_mmhg: vec![NOISE, 0.0],
         publish_period_ns: 100_000_000,

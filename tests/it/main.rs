@@ -7,6 +7,7 @@ mod cli;
 mod config;
 mod discrepancy;
 mod kalman;
+mod lanes;
 mod live;
 mod model;
 mod reproduce;

@@ -387,6 +387,8 @@ impl Broken {
 }
 
 impl Model for Broken {
+    type Lanes = hemostream::model::lanes::NoLanes;
+
     fn states(&self) -> &[Quantity] {
         self.0.states()
     }

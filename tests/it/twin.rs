@@ -50,6 +50,7 @@ pub fn settings(coupling: CouplingKind, observed: &[State], estimate: &[Paramete
         adaptation: Adaptation::OFF,
         live: LiveSettings::default(),
         stopping: Stopping::default(),
+        instructions: hemostream::model::lanes::InstructionSet::default(),
         channels: observed.iter().map(channel).collect(),
         aleatoric_sd_mmhg: NOISE.to_vec(),
         publish_period_ns: 20_000_000,

@@ -427,6 +427,11 @@ impl Checker {
     }
 
     fn service_and_network(&mut self, config: &Config) {
+        let instructions = config.service.instruction_set.set();
+        if !instructions.is_available() {
+            let name = instructions.name();
+            self.refuse("service.instruction_set", format!("found \"{name}\", expected one that this processor has"));
+        }
         self.whole("service.workers", config.service.workers, 0..=1024);
         self.whole("service.max_beds", config.service.max_beds, 1..=65_536);
         self.whole("service.queue_blocks", config.service.queue_blocks, 1..=1_000_000);

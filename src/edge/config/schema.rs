@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 
 use super::patient::Patient;
 use crate::model::cvsim6::Pressures;
+use crate::model::lanes::InstructionSet;
 
 /// The effective configuration. See [`Config::load`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -326,10 +327,41 @@ pub struct PublishSettings {
 pub struct ServiceSettings {
     /// Threads that solve windows; 0 for one per core.
     pub workers: usize,
+    /// What kernels run on.
+    #[serde(deserialize_with = "by_name")]
+    pub instruction_set: Instructions,
     /// Beds served at the same time.
     pub max_beds: usize,
     /// Blocks of samples queued per bed.
     pub queue_blocks: usize,
+}
+
+/// Vector instructions that kernels use; the results are the same with all.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Instructions {
+    /// The best that this processor has.
+    #[default]
+    Best,
+    /// Those that every processor has.
+    Portable,
+    /// Four numbers at a time.
+    Avx2,
+    /// Eight numbers at a time.
+    Avx512,
+}
+
+impl Instructions {
+    /// Those meant on this processor.
+    #[must_use]
+    pub fn set(self) -> InstructionSet {
+        match self {
+            Self::Best => InstructionSet::best(),
+            Self::Portable => InstructionSet::Portable,
+            Self::Avx2 => InstructionSet::Avx2,
+            Self::Avx512 => InstructionSet::Avx512,
+        }
+    }
 }
 
 /// `[zenoh]`
@@ -383,7 +415,12 @@ impl Default for Config {
                 json: true,
                 status_rate_hz: 1.0,
             },
-            service: ServiceSettings { workers: 0, max_beds: 256, queue_blocks: 1024 },
+            service: ServiceSettings {
+                workers: 0,
+                instruction_set: Instructions::Best,
+                max_beds: 256,
+                queue_blocks: 1024,
+            },
             zenoh: ZenohSettings {
                 mode: ZenohMode::Peer,
                 listen: vec!["tcp/127.0.0.1:7447".to_owned()],

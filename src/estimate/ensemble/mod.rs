@@ -2,6 +2,7 @@
 
 mod beats;
 mod clock;
+mod forecast;
 mod look;
 mod review;
 mod setup;
@@ -12,6 +13,7 @@ use rand_chacha::ChaCha8Rng;
 
 use self::beats::Beats;
 use self::clock::Edit;
+use self::forecast::Forecaster;
 use self::review::Memory;
 pub use self::setup::with_companions;
 use self::setup::{channel_fit, check, draw_bases};
@@ -93,7 +95,7 @@ pub struct WindowReport {
 
 /// The ensemble of one bed.
 #[derive(Debug, Clone)]
-pub struct Ensemble<M> {
+pub struct Ensemble<M: Model> {
     pub(super) model: M,
     pub(super) settings: EstimatorSettings,
     /// What is estimated, the phase along with the heart rate.
@@ -129,6 +131,8 @@ pub struct Ensemble<M> {
     /// In order of time: those to come, and those of the last moments.
     edits: Vec<Edit>,
     applied: Vec<Edit>,
+    /// None where members are solved one by one.
+    forecaster: Option<Forecaster<M::Lanes>>,
     beats: Option<Beats>,
 }
 
@@ -201,8 +205,14 @@ impl<M: Model> Ensemble<M> {
             clock_waits: false,
             edits: Vec::new(),
             applied: Vec::new(),
+            forecaster: None,
             beats: None,
         };
+        if ensemble.settings.coupling.is_xtfc() {
+            let instructions = ensemble.settings.instructions;
+            let forecaster = |lanes| Forecaster::new(lanes, instructions, &ensemble.members);
+            ensemble.forecaster = ensemble.model.lanes().map(forecaster);
+        }
         ensemble.initial_sd = (0..ensemble.estimated.len()).map(|k| ensemble.coordinate(k).1).collect();
         if ensemble.settings.coupling == CouplingKind::Ukf {
             ensemble.unscented = Some(Unscented::new(&ensemble.rows(), m, &mut ensemble.rng));
@@ -280,6 +290,10 @@ impl<M: Model> Ensemble<M> {
         noise: &[f64],
         parallel: &dyn Parallel,
     ) -> WindowReport {
+        if observations.is_empty() {
+            self.forecast();
+            return self.account(0);
+        }
         let before = self.coordinates();
         let Self { model, settings, unknowns, members, root, .. } = self;
         let (model, settings, unknowns, root) = (&*model, &*settings, &*unknowns, &*root);
@@ -289,9 +303,7 @@ impl<M: Model> Ensemble<M> {
             member.solve(model, settings, unknowns, root);
         });
         let mut report = self.account(observations.len());
-        if !observations.is_empty() {
-            report.informed = self.compare(&before);
-        }
+        report.informed = self.compare(&before);
         report
     }
 
@@ -457,6 +469,9 @@ impl<M: Model> Ensemble<M> {
             member.basis = donor.basis;
             member.solved = true;
             replaced += 1;
+        }
+        if let Some(forecaster) = &mut self.forecaster {
+            forecaster.renew(&self.members);
         }
         replaced
     }

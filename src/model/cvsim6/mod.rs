@@ -1,4 +1,6 @@
-#![doc = include_str!("cvsim6.md")]
+#![doc = include_str!("../cvsim6.md")]
+
+mod lanes;
 
 use nalgebra::{SMatrix, SVector};
 
@@ -449,19 +451,23 @@ impl Moment {
 
 impl Cvsim6 {
     fn beat_time(&self, t_s: f64, theta: &Parameters) -> BeatTime {
-        let cycle_s = 60.0 / theta.heart_rate;
-        let phase = theta.beat_phase + t_s / cycle_s;
+        self.time_in_beat(t_s, theta.heart_rate, theta.beat_phase, theta.systole)
+    }
+
+    fn time_in_beat(&self, t_s: f64, heart_rate: f64, beat_phase: f64, systole: f64) -> BeatTime {
+        let cycle_s = 60.0 / heart_rate;
+        let phase = beat_phase + t_s / cycle_s;
         let time_s = (phase - phase.floor()) * cycle_s;
         let (unit_s, by_heart_rate) = match self.systole {
             SystoleRule::Seconds => (1.0, 0.0),
-            SystoleRule::Fraction => (cycle_s, -theta.systole * cycle_s / theta.heart_rate),
-            SystoleRule::Bazett => (cycle_s.sqrt(), -0.5 * theta.systole * cycle_s.sqrt() / theta.heart_rate),
+            SystoleRule::Fraction => (cycle_s, -systole * cycle_s / heart_rate),
+            SystoleRule::Bazett => (cycle_s.sqrt(), -0.5 * systole * cycle_s.sqrt() / heart_rate),
         };
         BeatTime {
             time_s,
             cycle_s,
-            by_heart_rate: (t_s - time_s) / theta.heart_rate,
-            systole_s: theta.systole * unit_s,
+            by_heart_rate: (t_s - time_s) / heart_rate,
+            systole_s: systole * unit_s,
             systole_by_parameter: unit_s,
             systole_by_heart_rate: by_heart_rate,
         }
@@ -550,6 +556,12 @@ impl Cvsim6 {
 }
 
 impl Model for Cvsim6 {
+    type Lanes = Self;
+
+    fn lanes(&self) -> Option<Self> {
+        Some(*self)
+    }
+
     fn states(&self) -> &[Quantity] {
         STATES
     }
