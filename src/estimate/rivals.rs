@@ -4,7 +4,7 @@
 
 use rand::Rng;
 
-use super::coupling::coupled::{covariance, gain, semidefinite_cholesky};
+use super::coupling::coupled::{covariance, gain, semidefinite_cholesky, with_noise};
 use super::ensemble::{Ensemble, Observation, Parallel, WindowReport};
 use super::member::{Member, expectations};
 use super::random::exact_normals;
@@ -54,8 +54,7 @@ impl<M: Model> Ensemble<M> {
         let expected = expectations(&self.members, sd.len());
         let noise = exact_normals(sd.len(), members, &rows, &mut self.rng);
         let m = sd.len();
-        let mut innovation = covariance(&expected, &expected, members);
-        (0..m).for_each(|j| innovation[j * m + j] += sd[j] * sd[j]);
+        let innovation = with_noise(covariance(&expected, &expected, members), &sd);
         report.innovations = (0..m)
             .map(|j| {
                 let mean = mean_and_sd(&expected[j * members..][..members]).0;
@@ -94,8 +93,7 @@ impl<M: Model> Ensemble<M> {
         filter.covariance = moments(&ends, &ends);
         if m > 0 {
             let sd = self.stated_noise(observations);
-            let mut innovation = moments(&expected, &expected);
-            (0..m).for_each(|j| innovation[j * m + j] += sd[j] * sd[j]);
+            let innovation = with_noise(moments(&expected, &expected), &sd);
             let off: Vec<f64> =
                 expected.chunks_exact(points).zip(observations).map(|(row, o)| o.value - weighted_mean(row)).collect();
             report.innovations = (0..m).map(|j| off[j] / innovation[j * m + j].sqrt()).collect();

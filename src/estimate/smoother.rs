@@ -6,7 +6,7 @@
 
 use std::collections::VecDeque;
 
-use super::coupling::coupled::{covariance, gain};
+use super::coupling::coupled::{covariance, gain, with_noise};
 use super::statistics::centred;
 use super::time::EventTime;
 
@@ -46,8 +46,7 @@ impl Correction {
     #[must_use]
     pub fn new(expected: &[f64], off: &[f64], sd: &[f64], members: usize) -> Option<Self> {
         let m = sd.len();
-        let mut innovation = covariance(expected, expected, members);
-        (0..m).for_each(|j| innovation[j * m + j] += sd[j] * sd[j]);
+        let innovation = with_noise(covariance(expected, expected, members), sd);
         let of_members: Vec<f64> = (0..members).flat_map(|i| (0..m).map(move |j| off[j * members + i])).collect();
         let solved = gain(&of_members, &innovation, m)?;
         let weights = (0..m).flat_map(|j| solved.iter().skip(j).step_by(m).copied()).collect();

@@ -111,13 +111,18 @@ pub(super) fn solve_spd(a: &mut [f64], n: usize, b: &mut [f64]) -> bool {
             }
         }
     }
+    substitute(a, n, b);
+    true
+}
+
+/// `(L L^T)^-1 b` in place, for a lower triangular `L` `[n x n]` without zeros on the diagonal.
+pub(crate) fn substitute(l: &[f64], n: usize, b: &mut [f64]) {
     for i in 0..n {
-        let sum: f64 = (0..i).map(|k| a[i * n + k] * b[k]).sum();
-        b[i] = (b[i] - sum) / a[i * n + i];
+        let sum: f64 = (0..i).map(|k| l[i * n + k] * b[k]).sum();
+        b[i] = (b[i] - sum) / l[i * n + i];
     }
     for i in (0..n).rev() {
-        let sum: f64 = (i + 1..n).map(|k| a[k * n + i] * b[k]).sum();
-        b[i] = (b[i] - sum) / a[i * n + i];
+        let sum: f64 = (i + 1..n).map(|k| l[k * n + i] * b[k]).sum();
+        b[i] = (b[i] - sum) / l[i * n + i];
     }
-    true
 }

@@ -16,6 +16,6 @@ pub mod basis;
 pub mod collocation;
 pub mod dense;
 pub mod features;
-mod lu;
+pub(crate) mod lu;
 pub mod problem;
 pub mod sweeps;

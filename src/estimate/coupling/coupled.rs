@@ -5,6 +5,7 @@
 //! it is the stochastic ensemble Kalman filter, and tends to the exact Kalman filter as members are added.
 
 use crate::estimate::statistics::centred;
+use crate::xtfc::lu::substitute;
 
 /// Pivots below this share of the variance they came from are rounding: the direction has no spread left.
 const SINGULAR: f64 = 1e-12;
@@ -30,6 +31,13 @@ pub(crate) fn covariance(a: &[f64], b: &[f64], members: usize) -> Vec<f64> {
     a.iter().flat_map(|a| b.iter().map(|b| product(a, b)).collect::<Vec<_>>()).collect()
 }
 
+/// The covariance of samples from that of what is expected of them `[m x m]`, and the noise of each.
+pub(crate) fn with_noise(mut expected: Vec<f64>, sd: &[f64]) -> Vec<f64> {
+    let m = sd.len();
+    sd.iter().enumerate().for_each(|(j, sd)| expected[j * m + j] += sd * sd);
+    expected
+}
+
 /// `cross S^-1` for symmetric `S` `[m x m]`, `[n x m]`; None if `S` is not definite.
 pub(crate) fn gain(cross: &[f64], innovation: &[f64], m: usize) -> Option<Vec<f64>> {
     let mut factor = innovation.to_vec();
@@ -38,16 +46,7 @@ pub(crate) fn gain(cross: &[f64], innovation: &[f64], m: usize) -> Option<Vec<f6
         return None;
     }
     let mut gain = cross.to_vec();
-    for row in gain.chunks_exact_mut(m) {
-        for i in 0..m {
-            let known: f64 = (0..i).map(|k| factor[i * m + k] * row[k]).sum();
-            row[i] = (row[i] - known) / factor[i * m + i];
-        }
-        for i in (0..m).rev() {
-            let known: f64 = (i + 1..m).map(|k| factor[k * m + i] * row[k]).sum();
-            row[i] = (row[i] - known) / factor[i * m + i];
-        }
-    }
+    gain.chunks_exact_mut(m).for_each(|row| substitute(&factor, m, row));
     Some(gain)
 }
 

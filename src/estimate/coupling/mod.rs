@@ -10,8 +10,8 @@ use crate::xtfc::problem::Unknowns;
 #[must_use]
 pub fn coupled_unknowns<M: Model>(model: &M, parameters: &[usize], transforms: &[Transform]) -> Unknowns {
     let phase = model.cycle().map(|cycle| cycle.phase);
-    // A trust region. A quarter, or most of a typical size, is far beyond any sensible update; a clock that moves further than this in one step
-    // leaves the part of the beat in which its effect was linear.
+    // A trust region. A quarter, or most of a typical size, is far beyond any sensible update; a clock that moves further
+    // than this in one step leaves the part of the beat in which its effect was linear.
     let max_step = |(p, transform): (&usize, &Transform)| match transform {
         _ if Some(*p) == phase => 0.02,
         Transform::Log => 0.25,

@@ -123,16 +123,17 @@ impl<M: Model> Ensemble<M> {
     }
 
     /// Mean rate of the cycles \[1/s\].
-    #[allow(clippy::cast_precision_loss)]
     pub fn rate_hz(&self) -> Option<f64> {
-        let rate = self.model.cycle()?.rate;
-        Some(self.members.iter().map(|member| member.theta[rate]).sum::<f64>() / self.members.len() as f64 / 60.0)
+        Some(self.mean_of(self.model.cycle()?.rate) / 60.0)
     }
 
     /// Cycles counted at the end of the last window, by the mean clock of the members; None in models without cycles.
-    #[allow(clippy::cast_precision_loss)]
     pub fn cycles(&self) -> Option<f64> {
-        let phase = self.model.cycle()?.phase;
-        Some(self.members.iter().map(|member| member.theta[phase]).sum::<f64>() / self.members.len() as f64)
+        Some(self.mean_of(self.model.cycle()?.phase))
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn mean_of(&self, parameter: usize) -> f64 {
+        self.parameter_of_members(parameter).sum::<f64>() / self.members.len() as f64
     }
 }

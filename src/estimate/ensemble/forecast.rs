@@ -1,8 +1,8 @@
 //! Windows that nothing is learnt from: all members at once, in lanes.
 
-use super::{Ensemble, Member};
+use super::{Ensemble, Member, Parallel};
 use crate::model::Model;
-use crate::model::lanes::{InstructionSet, Lanes, WIDTH};
+use crate::model::lanes::{InstructionSet, LaneModel, Lanes, WIDTH};
 use crate::xtfc::basis::Basis;
 use crate::xtfc::sweeps::{Batch, Expressions};
 
@@ -16,7 +16,7 @@ pub(super) struct Forecaster<L> {
     batch: Batch,
 }
 
-impl<L> Forecaster<L> {
+impl<L: LaneModel> Forecaster<L> {
     pub(super) fn new(model: L, instructions: InstructionSet, members: &[Member]) -> Self {
         let mut forecaster = Self { model, instructions, expressions: Vec::new(), batch: Batch::default() };
         forecaster.renew(members);
@@ -31,28 +31,39 @@ impl<L> Forecaster<L> {
         };
         self.expressions = members.chunks(WIDTH).map(expressions).collect();
     }
-}
 
-impl<M: Model> Ensemble<M> {
-    /// Solves a window without samples for every member.
-    pub(super) fn forecast(&mut self) {
-        let Self { model, settings, unknowns, members, forecaster, .. } = self;
-        let Some(forecaster) = forecaster else {
-            return members.iter_mut().for_each(|member| member.solve_without_samples(model, settings, unknowns));
-        };
-        let Forecaster { model: lanes, instructions, expressions, batch } = forecaster;
+    /// Solves what can be solved in lanes.
+    fn sweep(&mut self, members: &mut [Member], tolerance_mmhg: f64) {
+        let Self { model, instructions, expressions, batch } = self;
         for (members, expressions) in members.chunks_mut(WIDTH).zip(expressions) {
+            let Some(expressions) = expressions else { continue };
             gather(members, batch);
-            let solved = expressions.as_ref().is_some_and(|expressions| {
-                batch.solve(lanes, expressions, settings.stopping.tolerance_mmhg, *instructions)
-            });
-            for (lane, member) in members.iter_mut().enumerate() {
-                member.solved = solved && batch.read(lane, &member.theta, &mut member.solution);
-                if !member.solved {
-                    member.solve_without_samples(model, settings, unknowns);
+            if batch.solve(model, expressions, tolerance_mmhg, *instructions) {
+                for (lane, member) in members.iter_mut().enumerate() {
+                    member.solved = batch.read(lane, &member.theta, &mut member.solution);
                 }
             }
         }
+    }
+}
+
+impl<M: Model> Ensemble<M> {
+    /// Solves a window without samples for every member: in lanes, and one by one what is left.
+    pub(super) fn forecast(&mut self, parallel: &dyn Parallel) {
+        let Self { model, settings, unknowns, members, forecaster, .. } = self;
+        members.iter_mut().for_each(|member| member.solved = false);
+        if let Some(forecaster) = forecaster {
+            forecaster.sweep(members, settings.stopping.tolerance_mmhg);
+        }
+        if members.iter().all(|member| member.solved) {
+            return;
+        }
+        let (model, settings, unknowns) = (&*model, &*settings, &*unknowns);
+        parallel.for_each(members, &|_, member| {
+            if !member.solved {
+                member.solve_without_samples(model, settings, unknowns);
+            }
+        });
     }
 }
 

@@ -291,7 +291,7 @@ impl<M: Model> Ensemble<M> {
         parallel: &dyn Parallel,
     ) -> WindowReport {
         if observations.is_empty() {
-            self.forecast();
+            self.forecast(parallel);
             return self.account(0);
         }
         let before = self.coordinates();
