@@ -108,6 +108,7 @@ struct Run {
     windows: u64,
     iterations: u64,
     not_converged: u64,
+    one_by_one: u64,
     notices: u64,
     last: ArrivalTime,
 }
@@ -140,6 +141,7 @@ impl Run {
             windows: 0,
             iterations: 0,
             not_converged: 0,
+            one_by_one: 0,
             notices: 0,
             last: ArrivalTime(0),
         })
@@ -182,6 +184,7 @@ impl Run {
                     self.windows += 1;
                     self.iterations += window.report.iterations as u64;
                     self.not_converged += window.report.not_converged as u64;
+                    self.one_by_one += window.report.one_by_one as u64;
                 }
                 Output::Notice(notice) => {
                     self.notices += 1;
@@ -213,11 +216,12 @@ impl Run {
         let member_windows = self.windows as f64 * self.estimator.settings().members as f64;
         say(format!(
             "{:.3} s of record in {wall:.2} s ({:.1} patient-seconds per second), {} windows, {:.2} iterations per \
-             member and window, {} not converged",
+             member and window, {:.2} % solved one by one, {} not converged",
             self.seconds,
             self.seconds / wall,
             self.windows,
             self.iterations as f64 / member_windows.max(1.0),
+            100.0 * self.one_by_one as f64 / member_windows.max(1.0),
             self.not_converged,
         ));
         let refused: Vec<String> =

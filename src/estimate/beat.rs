@@ -32,13 +32,13 @@ impl BeatFollower {
     /// Takes in all members at one time, `[n_quantities x n_members]`, states first; the clock of the ensemble says how
     /// many beats there were and how fast they follow each other \[1/s\]. `theta` gives the parameters of a member.
     /// Returns the beat that ended, if one did.
-    pub fn follow<'t, M: Model>(
+    pub fn follow<M: Model>(
         &mut self,
         model: &M,
         time: EventTime,
         (beats, rate_hz): (f64, f64),
         values: &[f64],
-        theta: &dyn Fn(usize) -> &'t [f64],
+        theta: &dyn Fn(usize) -> Vec<f64>,
     ) -> Option<BeatEstimate> {
         let (before, beats_before) = self.last.replace((time, beats))?;
         let dt_s = time.as_s() - before.as_s();
@@ -64,12 +64,12 @@ impl BeatFollower {
         over
     }
 
-    fn read<'t, M: Model>(
+    fn read<M: Model>(
         &self,
         model: &M,
         (start_s, end_s): (f64, f64),
         (values, ahead): (&[f64], &[f64]),
-        theta: &dyn Fn(usize) -> &'t [f64],
+        theta: &dyn Fn(usize) -> Vec<f64>,
     ) -> BeatEstimate {
         let n_q = model.n_states() + model.derived().len();
         let members = self.extents.len() / n_q;
@@ -86,7 +86,7 @@ impl BeatFollower {
             // The extents are those of the same stretch of time for all; a member thinks that it was a little more or less
             // than one beat.
             let own_s = duration_s / (1.0 + ahead[i] - self.ahead[i]).max(0.1);
-            model.read_cycle(own_s, theta(i), &states, &derived, &mut row);
+            model.read_cycle(own_s, &theta(i), &states, &derived, &mut row);
             row.iter().enumerate().for_each(|(k, value)| read[k * members + i] = *value);
         }
         BeatEstimate {

@@ -6,7 +6,7 @@
 //! | [`settings`] | everything an estimator is told at the start |
 //! | [`window`] | samples in, closed windows out: event time, lateness, gaps, disorder |
 //! | [`ensemble`] | the members, one step of all of them, the second look, their clocks, what they say together |
-//! | [`member`] | one member: its features, state and parameters |
+//! | [`batch`] | eight members: their features, states and parameters, and one window of work on them |
 //! | [`coupling`] | what is free in a window and what the prior is: `independent`, `coupled` |
 //! | [`random`] | noise over the members with exact moments |
 //! | [`adapt`] | what is learnt about the assumptions: the pace of parameters, the noise of sensors, the fit of the model |
@@ -40,11 +40,11 @@
 //! Deliberately absent: names of topics, wire formats, wall-clock time.
 
 pub mod adapt;
+pub mod batch;
 pub mod beat;
 pub mod coupling;
 pub mod ensemble;
 pub mod estimator;
-pub mod member;
 pub mod messages;
 pub mod random;
 mod rivals;

@@ -10,18 +10,22 @@
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
+use crate::model::lanes::{InstructionSet, WIDTH};
+
 /// Rows over the members, as an orthonormal and centred set.
 #[derive(Debug, Clone, Default)]
 pub struct Directions {
     members: usize,
     rows: Vec<f64>,
+    instructions: InstructionSet,
+    rest: Vec<f64>,
 }
 
 impl Directions {
     /// No direction yet.
     #[must_use]
-    pub fn new(members: usize) -> Self {
-        Self { members, rows: Vec::new() }
+    pub fn new(members: usize, instructions: InstructionSet) -> Self {
+        Self { members, rows: Vec::new(), instructions, rest: Vec::new() }
     }
 
     /// Number of directions.
@@ -37,26 +41,25 @@ impl Directions {
     }
 
     /// Centres `row` `[n_members]` and takes the directions out of it; returns what is left of its length, as a share.
-    #[allow(clippy::cast_precision_loss)]
     pub fn reduce(&self, row: &mut [f64]) -> f64 {
-        let mean = row.iter().sum::<f64>() / self.members as f64;
-        row.iter_mut().for_each(|v| *v -= mean);
-        let before = length(row);
-        // Twice, because once is not orthogonal to rounding.
-        for direction in self.rows.chunks_exact(self.members).chain(self.rows.chunks_exact(self.members)) {
-            let along: f64 = direction.iter().zip(row.iter()).map(|(a, b)| a * b).sum();
-            row.iter_mut().zip(direction).for_each(|(r, d)| *r -= along * d);
-        }
-        if before > 0.0 { length(row) / before } else { 0.0 }
+        self.instructions.run(Reduction { directions: &self.rows, row })
     }
 
     /// Adds what `row` has beyond the directions known; nothing if that is rounding.
     pub fn add(&mut self, row: &[f64]) {
-        let mut rest = row.to_vec();
+        let mut rest = std::mem::take(&mut self.rest);
+        rest.clear();
+        rest.extend_from_slice(row);
         if self.reduce(&mut rest) > 1e-9 {
-            let length = length(&rest);
-            self.rows.extend(rest.iter().map(|r| r / length));
+            self.add_reduced(&rest);
         }
+        self.rest = rest;
+    }
+
+    /// Adds a row that has been reduced.
+    fn add_reduced(&mut self, row: &[f64]) {
+        let length = length(row);
+        self.rows.extend(row.iter().map(|r| r / length));
     }
 
     /// Projections of the centred `row` on the directions.
@@ -65,15 +68,79 @@ impl Directions {
     }
 }
 
+/// What runs in code for an instruction set.
+struct Reduction<'a> {
+    directions: &'a [f64],
+    row: &'a mut [f64],
+}
+
+#[allow(clippy::inline_always)]
+impl pulp::NullaryFnOnce for Reduction<'_> {
+    type Output = f64;
+
+    #[allow(clippy::cast_precision_loss)]
+    #[inline(always)]
+    fn call(self) -> f64 {
+        let Self { directions, row } = self;
+        let mean = sum(row, |v| v) / row.len() as f64;
+        row.iter_mut().for_each(|v| *v -= mean);
+        let before = length(row);
+        // Twice, because once is not orthogonal to rounding.
+        for _ in 0..2 {
+            for direction in directions.chunks_exact(row.len().max(1)) {
+                let along = dot(direction, row);
+                row.iter_mut().zip(direction).for_each(|(r, d)| *r -= along * d);
+            }
+        }
+        if before > 0.0 { length(row) / before } else { 0.0 }
+    }
+}
+
+// Sums in eight parts, whatever the instruction set: the same bits everywhere.
+
+#[allow(clippy::inline_always)]
+#[inline(always)]
+fn sum(row: &[f64], of: impl Fn(f64) -> f64) -> f64 {
+    let (whole, rest) = row.as_chunks::<WIDTH>();
+    let mut parts = [0.0; WIDTH];
+    for chunk in whole {
+        for (part, v) in parts.iter_mut().zip(chunk) {
+            *part += of(*v);
+        }
+    }
+    parts.iter().sum::<f64>() + rest.iter().map(|v| of(*v)).sum::<f64>()
+}
+
+#[allow(clippy::inline_always)]
+#[inline(always)]
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let ((whole_a, rest_a), (whole_b, rest_b)) = (a.as_chunks::<WIDTH>(), b.as_chunks::<WIDTH>());
+    let mut parts = [0.0; WIDTH];
+    for (a, b) in whole_a.iter().zip(whole_b) {
+        for ((part, a), b) in parts.iter_mut().zip(a).zip(b) {
+            *part += a * b;
+        }
+    }
+    parts.iter().sum::<f64>() + rest_a.iter().zip(rest_b).map(|(a, b)| a * b).sum::<f64>()
+}
+
+#[allow(clippy::inline_always)]
+#[inline(always)]
 fn length(row: &[f64]) -> f64 {
-    row.iter().map(|v| v * v).sum::<f64>().sqrt()
+    sum(row, |v| v * v).sqrt()
 }
 
 /// `rows x members` standard normals, row-major: centred, of sample variance 1 and, where there are members enough,
 /// orthogonal to each other and to the rows of `against` `[any x members]`.
 #[allow(clippy::cast_precision_loss)]
-pub fn exact_normals<R: Rng>(rows: usize, members: usize, against: &[f64], rng: &mut R) -> Vec<f64> {
-    let mut taken = Directions::new(members);
+pub fn exact_normals<R: Rng>(
+    rows: usize,
+    members: usize,
+    against: &[f64],
+    rng: &mut R,
+    instructions: InstructionSet,
+) -> Vec<f64> {
+    let mut taken = Directions::new(members, instructions);
     // Few members have too few directions left to be random in.
     let exact = members > 2 * (rows + against.len() / members.max(1)) + 1;
     if exact {
@@ -82,16 +149,17 @@ pub fn exact_normals<R: Rng>(rows: usize, members: usize, against: &[f64], rng: 
     let mut out = Vec::with_capacity(rows * members);
     let target = (members as f64 - 1.0).max(1.0).sqrt();
     for _ in 0..rows {
-        let mut row: Vec<f64> = (0..members).map(|_| StandardNormal.sample(rng)).collect();
-        taken.reduce(&mut row);
-        let length = length(&row);
+        let at = out.len();
+        out.extend((0..members).map(|_| -> f64 { StandardNormal.sample(rng) }));
+        let row = &mut out[at..];
+        taken.reduce(row);
+        let length = length(row);
         if length > 0.0 {
             row.iter_mut().for_each(|v| *v *= target / length);
         }
         if exact {
-            taken.add(&row);
+            taken.add_reduced(row);
         }
-        out.extend(row);
     }
     out
 }
@@ -101,7 +169,11 @@ mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
-    use super::exact_normals;
+    use super::InstructionSet;
+
+    fn exact_normals(rows: usize, members: usize, against: &[f64], rng: &mut ChaCha8Rng) -> Vec<f64> {
+        super::exact_normals(rows, members, against, rng, InstructionSet::best())
+    }
 
     #[test]
     fn draws_are_centred_of_variance_one_and_orthogonal_to_each_other_and_to_what_is_given() {

@@ -4,12 +4,13 @@
 
 use rand::Rng;
 
+use super::batch::{Batch, expectations, read};
 use super::coupling::coupled::{covariance, gain, semidefinite_cholesky, with_noise};
-use super::ensemble::{Ensemble, Observation, Parallel, WindowReport};
-use super::member::{Member, expectations};
+use super::ensemble::{Ensemble, Observation, Parallel, Serial, WindowReport};
 use super::random::exact_normals;
 use super::statistics::mean_and_sd;
 use crate::model::Model;
+use crate::model::lanes::{InstructionSet, Lanes, WIDTH};
 
 /// Unscented Kalman filter over (state, parameter coordinates): mean, covariance, and a standard normal cloud that
 /// stands for the posterior wherever members are asked for.
@@ -21,16 +22,16 @@ pub(super) struct Unscented {
     /// `[n x n_members]`
     cloud: Vec<f64>,
     /// The sigma points, as members.
-    points: Vec<Member>,
+    points: Vec<Batch>,
 }
 
 impl Unscented {
     /// With the moments of `rows` `[n x n_members]`.
-    pub(super) fn new<R: Rng>(rows: &[f64], members: usize, rng: &mut R) -> Self {
+    pub(super) fn new<R: Rng>(rows: &[f64], members: usize, rng: &mut R, instructions: InstructionSet) -> Self {
         let n = rows.len() / members;
         let mean: Vec<f64> = rows.chunks_exact(members).map(|row| mean_and_sd(row).0).collect();
         let covariance = covariance(rows, rows, members);
-        Self { mean, covariance, cloud: exact_normals(n, members, &[], rng), points: Vec::new() }
+        Self { mean, covariance, cloud: exact_normals(n, members, &[], rng, instructions), points: Vec::new() }
     }
 }
 
@@ -38,21 +39,15 @@ impl<M: Model> Ensemble<M> {
     /// Forecast, then the stochastic update with perturbed observations.
     pub(super) fn enkf_step(&mut self, observations: &[Observation], h: f64, parallel: &dyn Parallel) -> WindowReport {
         self.wander_for(h);
-        let Self { model, settings, .. } = &*self;
-        let (model, settings) = (model.clone(), settings.clone());
-        parallel.for_each(&mut self.members, &|_, member| {
-            let end = member.forecast(&model, observations, &settings, h);
-            model.advance(h, &mut member.theta);
-            member.go(&model, h, &end);
-        });
+        self.each(parallel, |tools, batch| batch.look_ahead(tools, observations, h));
         let mut report = WindowReport { solved: self.len(), ..Default::default() };
         if observations.is_empty() {
             return report;
         }
         let members = self.len();
         let (rows, sd) = (self.rows(), self.stated_noise(observations));
-        let expected = expectations(&self.members, sd.len());
-        let noise = exact_normals(sd.len(), members, &rows, &mut self.rng);
+        let expected = expectations(&self.batches, sd.len());
+        let noise = exact_normals(sd.len(), members, &rows, &mut self.rng, self.settings.instructions);
         let m = sd.len();
         let innovation = with_noise(covariance(&expected, &expected, members), &sd);
         report.innovations = (0..m)
@@ -111,7 +106,8 @@ impl<M: Model> Ensemble<M> {
                 }
             }
         }
-        let clocks = filter.points[0].theta.clone();
+        let mut clocks = Vec::new();
+        read(&filter.points[0].theta, 0, &mut clocks);
         self.draw_cloud(&filter, &clocks, h);
         self.unscented = Some(filter);
         if m > 0 {
@@ -146,20 +142,23 @@ impl<M: Model> Ensemble<M> {
         let mut root = filter.covariance.clone();
         semidefinite_cholesky(&mut root, n);
         let reach = (n as f64).sqrt();
-        let base = &self.members[0];
-        filter.points.resize_with(2 * n, || Member::new(None, base.x.clone(), base.theta.clone()));
-        for (i, point) in filter.points.iter_mut().enumerate() {
+        let base = self.theta_of(0);
+        let point = |i: usize| {
             let (column, sign) = (i % n, if i < n { reach } else { -reach });
             let at = |row: usize| filter.mean[row] + if column <= row { sign * root[row * n + column] } else { 0.0 };
-            point.x.iter_mut().enumerate().for_each(|(s, x)| *x = at(s));
-            point.theta.clone_from(&base.theta);
+            let mut theta = base.clone();
             for (k, &p) in self.estimated().iter().enumerate() {
-                point.theta[p] = self.settings.beliefs[p].value(self.transforms[k], at(states + k));
+                theta[p] = self.settings.beliefs[p].value(self.transforms[k], at(states + k));
             }
-            let end = point.forecast(&self.model, observations, &self.settings, h);
-            point.x.clone_from(&end);
-            self.model.advance(h, &mut point.theta);
-        }
+            ((0..states).map(at).collect::<Vec<f64>>(), theta)
+        };
+        let batch = |first: usize| {
+            let (xs, thetas): (Vec<_>, Vec<_>) = (first..(first + WIDTH).min(2 * n)).map(point).unzip();
+            Batch::new(first, Vec::new(), &xs, &thetas)
+        };
+        filter.points = (0..2 * n).step_by(WIDTH).map(batch).collect();
+        let tools = self.tools();
+        filter.points.iter_mut().for_each(|batch| batch.look_ahead(&tools, observations, h));
         2 * n
     }
 
@@ -175,10 +174,9 @@ impl<M: Model> Ensemble<M> {
                 rows.push(filter.mean[i] + along);
             }
         }
-        for member in &mut self.members {
-            member.theta.copy_from_slice(clocks);
-            let end = member.x.clone();
-            member.go(&self.model, h, &end);
+        for batch in &mut self.batches {
+            batch.window.start.clone_from(&batch.x);
+            batch.theta.iter_mut().zip(clocks).for_each(|(theta, clock)| *theta = Lanes::splat(*clock));
         }
         self.place(&rows, h);
     }
@@ -186,18 +184,22 @@ impl<M: Model> Ensemble<M> {
     /// Sets states and parameters at the end of the window from `rows` `[n_u x n_members]`.
     fn place(&mut self, rows: &[f64], h: f64) {
         let (members, n) = (self.len(), self.model.n_states());
-        for (i, member) in self.members.iter_mut().enumerate() {
+        let Self { batches, estimated, transforms, settings, .. } = self;
+        for batch in batches.iter_mut() {
+            let (first, count) = (batch.first(), batch.len());
+            let own = |row: usize| &rows[row * members + first..][..count];
             for s in 0..n {
-                member.x[s] = rows[s * members + i];
-                member.solution.end[s] = member.x[s];
+                batch.x[s].0[..count].copy_from_slice(own(s));
             }
-            for (k, &p) in self.estimated.iter().enumerate() {
-                let u = rows[(n + k) * members + i];
-                member.theta[p] = self.settings.beliefs[p].value(self.transforms[k], u);
+            for (k, &p) in estimated.iter().enumerate() {
+                for (value, u) in batch.theta[p].0.iter_mut().zip(own(n + k)) {
+                    *value = settings.beliefs[p].value(transforms[k], *u);
+                }
             }
-            member.solution.theta.clone_from(&member.theta);
-            self.model.advance(-h, &mut member.solution.theta);
+            batch.fill_up();
+            batch.window.end.clone_from(&batch.x);
         }
+        self.each(&Serial, |tools, batch| batch.start_from_end(tools, h));
     }
 
     fn stated_noise(&self, observations: &[Observation]) -> Vec<f64> {

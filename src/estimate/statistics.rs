@@ -1,6 +1,7 @@
 //! Summaries of an ensemble.
 
 use super::random::Directions;
+use crate::model::lanes::InstructionSet;
 
 /// One quantity: where it is, and how uncertain by source.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -77,7 +78,7 @@ impl Explainers {
     /// From the rows of `variables`, each `[n_members]`.
     #[must_use]
     pub fn new(variables: &[f64], members: usize) -> Self {
-        let mut directions = Directions::new(members);
+        let mut directions = Directions::new(members, InstructionSet::default());
         variables.chunks_exact(members).for_each(|variable| directions.add(variable));
         Self { members, directions }
     }

@@ -45,18 +45,179 @@ impl Lanes {
         out
     }
 
-    /// The value where it is positive, else 0; so a number that is none becomes 0.
+    /// `yes` where this is positive, else `no`.
     #[must_use]
     #[inline(always)]
-    pub fn positive_part(self) -> Self {
-        self.map(|v| if v > 0.0 { v } else { 0.0 })
+    pub fn choose(self, yes: Self, no: Self) -> Self {
+        let mut out = no;
+        for ((out, yes), value) in out.0.iter_mut().zip(&yes.0).zip(&self.0) {
+            *out = if *value > 0.0 { *yes } else { *out };
+        }
+        out
+    }
+
+    /// Of eight numbers in a row.
+    #[must_use]
+    #[inline(always)]
+    pub fn load(row: &[f64; WIDTH]) -> Self {
+        Self(*row)
+    }
+
+    /// The nearest whole number, for numbers below 2^51.
+    #[must_use]
+    #[inline(always)]
+    fn rounded(self) -> Self {
+        // Where doubles are spaced by 1, addition rounds; unlike `f64::round`, in every instruction set.
+        let big = Self::splat(6_755_399_441_055_744.0);
+        (self + big) - big
+    }
+
+    /// The largest whole number that is not above, for numbers below 2^51.
+    #[must_use]
+    #[inline(always)]
+    pub fn floor(self) -> Self {
+        let near = self.rounded();
+        near - (near - self).choose(Self::splat(1.0), Self::splat(0.0))
+    }
+
+    /// Square root.
+    #[must_use]
+    #[inline(always)]
+    pub fn sqrt(self) -> Self {
+        let mut out = self;
+        for value in &mut out.0 {
+            *value = value.sqrt();
+        }
+        out
+    }
+
+    /// `c[0] + self c[1] + self^2 c[2] + ...`
+    #[inline(always)]
+    fn polynomial<const N: usize>(self, c: [f64; N]) -> Self {
+        // Even and odd powers apart: two chains of half the length, side by side.
+        let square = self * self;
+        let mut sums = [Self::splat(0.0); 2];
+        for k in (0..N).rev() {
+            sums[k % 2] = sums[k % 2] * square + Self::splat(c[k]);
+        }
+        sums[0] + sums[1] * self
+    }
+
+    /// Sine and cosine, within an ulp or two for arguments up to a few hundred (coefficients: fdlibm).
+    #[must_use]
+    #[inline(always)]
+    pub fn sin_cos(self) -> (Self, Self) {
+        let quarters = (self * Self::splat(std::f64::consts::FRAC_2_PI)).rounded();
+        // pi/2 in two parts, the first with zeros at its end, so that the product with a small number is exact.
+        let r =
+            self - quarters * Self::splat(1.570_796_326_734_125_6) - quarters * Self::splat(6.077_100_506_506_192e-11);
+        let z = r * r;
+        let sin = r + r
+            * z
+            * z.polynomial([
+                -1.666_666_666_666_663_2e-1,
+                8.333_333_333_322_49e-3,
+                -1.984_126_982_985_795e-4,
+                2.755_731_370_707_006_8e-6,
+                -2.505_076_025_340_686_3e-8,
+                1.589_690_995_211_55e-10,
+            ]);
+        let cos = Self::splat(1.0) - z * Self::splat(0.5)
+            + z * z
+                * z.polynomial([
+                    4.166_666_666_666_66e-2,
+                    -1.388_888_888_887_411e-3,
+                    2.480_158_728_947_673e-5,
+                    -2.755_731_435_139_066_3e-7,
+                    2.087_572_321_298_175e-9,
+                    -1.135_964_755_778_819_5e-11,
+                ]);
+        // quarters modulo 4: 0 (sin, cos), 1 (cos, -sin), 2 (-sin, -cos), 3 (-cos, sin).
+        let quarter = quarters - (quarters * Self::splat(0.25)).floor() * Self::splat(4.0);
+        let half = (quarter * Self::splat(0.5)).floor();
+        let odd = quarter - half * Self::splat(2.0);
+        let (s, c) = (odd.choose(cos, sin), odd.choose(sin, cos));
+        let turned = half.choose(Self::splat(-1.0), Self::splat(1.0));
+        let against = (odd - half).abs().choose(Self::splat(-1.0), Self::splat(1.0));
+        (turned * s, against * c)
+    }
+
+    /// `e^x`, within two ulps for arguments between -700 and 700.
+    #[must_use]
+    #[inline(always)]
+    pub fn exp(self) -> Self {
+        let doublings = (self * Self::splat(std::f64::consts::LOG2_E)).rounded();
+        let r = self
+            - doublings * Self::splat(6.931_471_803_691_238e-1)
+            - doublings * Self::splat(1.908_214_929_270_587_7e-10);
+        let series = r.polynomial([
+            1.0,
+            1.0,
+            1.0 / 2.0,
+            1.0 / 6.0,
+            1.0 / 24.0,
+            1.0 / 120.0,
+            1.0 / 720.0,
+            1.0 / 5_040.0,
+            1.0 / 40_320.0,
+            1.0 / 362_880.0,
+            1.0 / 3_628_800.0,
+            1.0 / 39_916_800.0,
+            1.0 / 479_001_600.0,
+            1.0 / 6_227_020_800.0,
+        ]);
+        // 2^k by its bits: added to this number, k + 1023 ends up in the lowest ones.
+        let big = Self::splat(6_755_399_441_055_744.0 + 1023.0);
+        let mut power = doublings + big;
+        for value in &mut power.0 {
+            *value = f64::from_bits(value.to_bits() << 52);
+        }
+        series * power
+    }
+
+    /// Natural logarithm of positive normal numbers, within two ulps.
+    #[must_use]
+    #[inline(always)]
+    pub fn ln(self) -> Self {
+        const HIDDEN: u64 = 0x000f_ffff_ffff_ffff;
+        // x = 2^k m with m in [sqrt(1/2), sqrt(2)).
+        let (mut above, mut exponent) = (self, self);
+        for (above, exponent) in above.0.iter_mut().zip(&mut exponent.0) {
+            let bits = above.to_bits();
+            *above = f64::from_bits((bits & HIDDEN) | 1.0_f64.to_bits());
+            *exponent = f64::from_bits((bits >> 52) | 4_503_599_627_370_496.0_f64.to_bits());
+        }
+        let large = above - Self::splat(std::f64::consts::SQRT_2);
+        let m = large.choose(above * Self::splat(0.5), above);
+        let k =
+            exponent - Self::splat(4_503_599_627_370_496.0 + 1023.0) + large.choose(Self::splat(1.0), Self::splat(0.0));
+        // ln m = 2 artanh(s), s = (m - 1)/(m + 1); coefficients and order of summation of fdlibm.
+        let f = m - Self::splat(1.0);
+        let s = f / (Self::splat(2.0) + f);
+        let z = s * s;
+        let rest = z * z.polynomial([
+            6.666_666_666_666_735e-1,
+            3.999_999_999_940_942e-1,
+            2.857_142_874_366_239e-1,
+            2.222_219_843_214_978_4e-1,
+            1.818_357_216_161_805e-1,
+            1.531_383_769_920_937_3e-1,
+            1.479_819_860_511_658_6e-1,
+        ]);
+        let half_square = f * f * Self::splat(0.5);
+        k * Self::splat(6.931_471_803_691_238e-1)
+            - ((half_square - (s * (half_square + rest) + k * Self::splat(1.908_214_929_270_587_7e-10))) - f)
     }
 
     /// Without its sign.
     #[must_use]
     #[inline(always)]
     pub fn abs(self) -> Self {
-        self.map(f64::abs)
+        let mut out = self;
+        for value in &mut out.0 {
+            *value = value.abs();
+        }
+        out
     }
 
     /// The larger of two, lane by lane; `other` where `self` is no number.
@@ -92,7 +253,8 @@ arithmetic!(Add add +, Sub sub -, Mul mul *, Div div /);
 
 /// The equations of a model for a batch of members, in the form that a kernel can repeat quickly: what does not change
 /// over a window, and what belongs to a moment of it, are worked out once.
-#[allow(clippy::inline_always)]
+///
+/// Functions without `self` are called within loops and have to be `#[inline(always)]`.
 pub trait LaneModel: Copy + fmt::Debug + Send + Sync {
     /// A state of every member, `[Lanes; n_states]`.
     type State: Copy + AsRef<[Lanes]> + AsMut<[Lanes]> + Default;
@@ -100,15 +262,60 @@ pub trait LaneModel: Copy + fmt::Debug + Send + Sync {
     type Fixed: Copy;
     /// What depends on the time only.
     type Moment: Copy + Default;
+    /// What `df/dx` depends on beside the time.
+    type Tangent: Copy + Default;
+    /// See [`LaneModel::relaxation`].
+    type Relaxation: Copy + Default;
 
     /// From the parameters of every member, `[n_parameters]`; None where these equations are not those of the model.
     fn fixed(&self, theta: &[Lanes]) -> Option<Self::Fixed>;
 
-    /// At `t_s` after the start of the window.
-    fn moment(&self, t_s: f64, theta: &[Lanes]) -> Self::Moment;
+    /// After one of the parameters has changed.
+    fn change(&self, fixed: &mut Self::Fixed, theta: &[Lanes], parameter: usize);
 
-    /// `f(t, x, theta)`; has to be `#[inline(always)]`.
-    fn rhs(fixed: &Self::Fixed, moment: &Self::Moment, x: &Self::State) -> Self::State;
+    /// At `t_s` after the start of the window.
+    fn moment(fixed: &Self::Fixed, t_s: f64) -> Self::Moment;
+
+    /// Derivative of [`LaneModel::moment`] by a parameter for which [`LaneModel::is_timed`].
+    fn moment_by(&self, fixed: &Self::Fixed, t_s: f64, theta: &[Lanes], parameter: usize) -> Self::Moment;
+
+    /// Whether moments depend on a parameter.
+    fn is_timed(parameter: usize) -> bool;
+
+    /// Whether [`LaneModel::push`] knows what a parameter does.
+    fn knows(&self, parameter: usize) -> bool;
+
+    /// `f(t, x, theta)`, and where the derivative is taken.
+    fn linearise(fixed: &Self::Fixed, moment: &Self::Moment, x: &Self::State) -> (Self::State, Self::Tangent);
+
+    /// `(df/dx)^T dual`
+    fn pull(fixed: &Self::Fixed, moment: &Self::Moment, tangent: &Self::Tangent, dual: &Self::State) -> Self::State;
+
+    /// An approximation of `(I - phi df/dx)^-1`: the better, the faster sweeps converge; their result does not depend on
+    /// it.
+    fn relaxation(fixed: &Self::Fixed, moment: &Self::Moment, tangent: &Self::Tangent, phi: Lanes) -> Self::Relaxation;
+
+    /// The relaxation, or its transpose, times a residual.
+    fn relax(relaxation: &Self::Relaxation, residual: &Self::State, transposed: bool) -> Self::State;
+
+    /// Whether one relaxation does for both.
+    fn is_alike(a: &Self::Tangent, b: &Self::Tangent) -> bool;
+
+    /// `dual^T df/dtheta_p`, from a moment and its derivative if it has one.
+    fn push(
+        fixed: &Self::Fixed,
+        moment: (&Self::Moment, Option<&Self::Moment>),
+        x: &Self::State,
+        dual: &Self::State,
+        parameter: usize,
+    ) -> Lanes;
+
+    /// Derived quantities at a time, `[n_derived]`; false, with nothing done, where these equations are not those of the
+    /// model.
+    fn derive(&self, t_s: f64, x: &Self::State, theta: &[Lanes], out: &mut [Lanes]) -> bool;
+
+    /// [`super::Model::advance`], by each lane's own time.
+    fn advance(&self, dt_s: f64, theta: &mut [Lanes]);
 }
 
 /// Of models that have no equations for lanes.
@@ -119,16 +326,54 @@ impl LaneModel for NoLanes {
     type State = [Lanes; 0];
     type Fixed = ();
     type Moment = ();
+    type Tangent = ();
+    type Relaxation = ();
 
     fn fixed(&self, _: &[Lanes]) -> Option<()> {
         None
     }
 
-    fn moment(&self, _: f64, _: &[Lanes]) {}
+    fn change(&self, (): &mut (), _: &[Lanes], _: usize) {}
 
-    fn rhs((): &(), (): &(), x: &Self::State) -> Self::State {
-        *x
+    fn moment((): &(), _: f64) {}
+
+    fn moment_by(&self, (): &(), _: f64, _: &[Lanes], _: usize) {}
+
+    fn is_timed(_: usize) -> bool {
+        false
     }
+
+    fn knows(&self, _: usize) -> bool {
+        false
+    }
+
+    fn linearise((): &(), (): &(), x: &Self::State) -> (Self::State, ()) {
+        (*x, ())
+    }
+
+    fn pull((): &(), (): &(), (): &(), dual: &Self::State) -> Self::State {
+        *dual
+    }
+
+    fn relaxation((): &(), (): &(), (): &(), _: Lanes) {}
+
+    fn relax((): &(), residual: &Self::State, _: bool) -> Self::State {
+        *residual
+    }
+
+    fn is_alike((): &(), (): &()) -> bool {
+        true
+    }
+
+    fn push((): &(), _: (&(), Option<&()>), _: &Self::State, _: &Self::State, _: usize) -> Lanes {
+        Lanes::default()
+    }
+
+    fn derive(&self, _: f64, _: &Self::State, _: &[Lanes], _: &mut [Lanes]) -> bool {
+        false
+    }
+
+    fn advance(&self, _: f64, _: &mut [Lanes]) {}
 }
 
 /// Vector instructions of a processor.
@@ -210,6 +455,27 @@ mod tests {
         lanes.0[3] = f64::NAN;
         assert!(!lanes.all_within(f64::INFINITY));
         assert!(!Lanes::splat(0.0).larger(lanes).all_within(1.0), "and stay none in a maximum");
+    }
+
+    #[test]
+    fn functions_agree_with_those_of_the_library() {
+        let close = |found: Lanes, expected: Lanes, ulps: f64| {
+            for (a, b) in found.0.iter().zip(expected.0) {
+                assert!((a - b).abs() <= ulps * f64::EPSILON * b.abs().max(1e-3), "{a} {b}");
+            }
+        };
+        for step in -40_000..40_000_i32 {
+            let x = Lanes(std::array::from_fn(|lane| f64::from(step) * 1e-3 + 1.3e-4 * lane as f64));
+            let (sin, cos) = x.sin_cos();
+            close(sin, x.map(f64::sin), 4.0);
+            close(cos, x.map(f64::cos), 4.0);
+            close(x.exp(), x.map(f64::exp), 4.0);
+            close(x.exp().ln(), x.exp().map(f64::ln), 2.0);
+            assert_eq!(x.floor(), x.map(f64::floor));
+        }
+        for x in [1.0, 2.0, 0.5, 1e-300, 1e300, std::f64::consts::SQRT_2, 0.999_999_999, 1.000_000_001] {
+            close(Lanes::splat(x).ln(), Lanes::splat(f64::ln(x)), 2.0);
+        }
     }
 
     #[test]

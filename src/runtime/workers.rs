@@ -5,9 +5,9 @@ use rayon::iter::{
     ParallelIterator,
 };
 
-use crate::estimate::ensemble::{Member, Parallel};
+use crate::estimate::ensemble::{Batch, Parallel};
 
-/// Members handed to a thread at a time: enough work to be worth the hand-over.
+/// Members handed to a thread at a time when they are drawn: enough work to be worth the hand-over.
 const CHUNK: usize = 12;
 
 /// The pool.
@@ -60,13 +60,11 @@ impl Workers {
 }
 
 impl Parallel for Workers {
-    fn for_each(&self, members: &mut [Member], job: &(dyn Fn(usize, &mut Member) + Sync)) {
+    fn for_each(&self, batches: &mut [Batch], job: &(dyn Fn(&mut Batch) + Sync)) {
         if self.threads() == 1 {
-            members.iter_mut().enumerate().for_each(|(i, member)| job(i, member));
+            batches.iter_mut().for_each(job);
         } else {
-            self.pool.install(|| {
-                members.par_iter_mut().enumerate().with_min_len(CHUNK).for_each(|(i, member)| job(i, member));
-            });
+            self.pool.install(|| batches.par_iter_mut().for_each(job));
         }
     }
 

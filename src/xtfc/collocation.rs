@@ -7,6 +7,9 @@ use crate::model::Model;
 /// Halvings of a step that makes things worse.
 const MAX_HALVINGS: usize = 8;
 
+/// Relative growth of the objective that is rounding.
+const ROUNDING: f64 = 1e-13;
+
 /// Scratch of the solver; reuse it from window to window.
 #[derive(Debug, Clone, Default)]
 pub struct CollocationSolver {
@@ -35,8 +38,6 @@ pub struct CollocationSolver {
     predicted: Vec<f64>,
     /// Whether the step was shortened to its limits.
     limited: bool,
-    /// See [`Solution::innovations`].
-    innovations: Vec<(f64, f64)>,
 }
 
 impl CollocationSolver {
@@ -48,7 +49,6 @@ impl CollocationSolver {
         self.point.place(problem);
         evaluate(&mut self.point, problem, &self.phi);
 
-        self.innovations.clear();
         let mut account = Account::default();
         while account.iterations < problem.stopping.max_iterations && !account.converged {
             account.iterations += 1;
@@ -61,7 +61,6 @@ impl CollocationSolver {
             account.converged = self.take_step(problem);
         }
         self.point.finish(problem, account, out);
-        std::mem::swap(&mut out.innovations, &mut self.innovations);
     }
 
     /// `df/dx` at the nodes, and `B` where there are samples to steer by.
@@ -170,9 +169,6 @@ impl CollocationSolver {
                 (self.covariance[j * m + k], self.covariance[k * m + j]) = (value, value);
             }
         }
-        if self.innovations.is_empty() {
-            self.innovations.extend(self.rho.iter().enumerate().map(|(j, r)| (*r, self.covariance[j * m + j])));
-        }
         // Definite by construction: identity plus Gram matrices. Only overflow can break it.
         if !solve_spd(&mut self.covariance, m, &mut self.rho) {
             self.rho.fill(f64::NAN);
@@ -200,7 +196,8 @@ impl CollocationSolver {
             self.trial.xi.iter_mut().zip(&self.step_xi).for_each(|(x, s)| *x += share * s);
             self.trial.place(problem);
             evaluate(&mut self.trial, problem, &self.phi);
-            if self.trial.objective(problem) <= before || self.agrees(problem, share) {
+            // Growth by rounding is none: near the minimiser, halved steps would never get there.
+            if self.trial.objective(problem) <= before * (1.0 + ROUNDING) || self.agrees(problem, share) {
                 break;
             }
             share *= 0.5;

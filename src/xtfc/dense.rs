@@ -49,7 +49,6 @@ pub fn solve<M: Model>(problem: &WindowProblem<'_, M>, out: &mut Solution) {
         point = next;
     }
     point.finish(problem, account, out);
-    out.innovations.clear();
 }
 
 fn evaluate<M: Model>(point: &mut Point, problem: &WindowProblem<'_, M>, phi: &[f64]) {

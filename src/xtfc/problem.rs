@@ -148,9 +148,6 @@ pub struct Solution {
     pub end: Vec<f64>,
     /// Parameters at the start of the window, `[n_parameters]`.
     pub theta: Vec<f64>,
-    /// Per sample, data residual and its variance when the physics holds and `xi = 0`: the innovation, in units of the
-    /// noise, and what the prior makes of it. Empty where the solver does not come across them.
-    pub innovations: Vec<(f64, f64)>,
     /// How it went.
     pub account: Account,
 }

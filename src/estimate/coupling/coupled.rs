@@ -21,6 +21,31 @@ pub fn covariance_root(rows: &[f64], members: usize, root: &mut Vec<f64>) {
     (0..n).for_each(|i| root[i * n + i + 1..(i + 1) * n].fill(0.0));
 }
 
+/// `root root^T`, `[n x n]`.
+#[must_use]
+pub fn square(root: &[f64], n: usize) -> Vec<f64> {
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    root.chunks_exact(n).flat_map(|a| root.chunks_exact(n).map(|b| dot(a, b)).collect::<Vec<_>>()).collect()
+}
+
+/// Inverse covariance of samples in units of their noise, `[m x m]`, from the covariance of what is expected of them.
+#[must_use]
+pub fn precision(expected: &[f64], sd: &[f64]) -> Vec<f64> {
+    let m = sd.len();
+    let mut factor = expected.to_vec();
+    for (j, row) in factor.chunks_exact_mut(m).enumerate() {
+        row.iter_mut().zip(sd).for_each(|(entry, other)| *entry /= sd[j] * other);
+        row[j] += 1.0;
+    }
+    semidefinite_cholesky(&mut factor, m);
+    let mut inverse = vec![0.0; m * m];
+    for (j, row) in inverse.chunks_exact_mut(m).enumerate() {
+        row[j] = 1.0;
+        substitute(&factor, m, row);
+    }
+    inverse
+}
+
 /// Sample covariance of two sets of rows over the members, `[n_a x n_b]`.
 #[allow(clippy::cast_precision_loss)]
 pub(crate) fn covariance(a: &[f64], b: &[f64], members: usize) -> Vec<f64> {

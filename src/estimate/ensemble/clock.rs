@@ -1,6 +1,7 @@
 //! The clocks of the members, where a beat did not come when it was due.
 
-use super::{Ensemble, Parallel};
+use super::{Batch, Ensemble, Parallel};
+use crate::estimate::batch::{read, write};
 use crate::estimate::random::exact_normals;
 use crate::estimate::timing::{ClockEdit, WAITING_PHASE};
 use crate::model::Model;
@@ -49,11 +50,11 @@ impl<M: Model> Ensemble<M> {
 
     /// Gives the states the spread that they started with: they have run by a wrong clock.
     fn spread_anew(&mut self) {
-        let (n, m) = (self.model.n_states(), self.members.len());
-        let draws = exact_normals(n, m, &self.rows(), &mut self.rng);
+        let (n, m) = (self.model.n_states(), self.len());
+        let draws = exact_normals(n, m, &self.rows(), &mut self.rng, self.settings.instructions);
         for (s, row) in draws.chunks_exact(m).enumerate() {
             let sd = self.settings.initial_state_sd[s];
-            self.members.iter_mut().zip(row).for_each(|(member, e)| member.x[s] += sd * e);
+            self.add_to_state(s, sd, row);
         }
     }
 
@@ -90,35 +91,51 @@ impl<M: Model> Ensemble<M> {
     fn begin_beat(&mut self, ahead_s: f64, rate: Option<f64>, another: bool) {
         let Some(cycle) = self.model.cycle() else { return };
         self.clock_waits = false;
-        let m = self.members.len();
+        let m = self.len();
         let known = !self.estimated.contains(&cycle.rate);
-        let draws = exact_normals(2, m, &self.rows(), &mut self.rng);
+        let draws = exact_normals(2, m, &self.rows(), &mut self.rng, self.settings.instructions);
         if let Some(rate) = rate {
             let (low, high) = self.settings.beliefs[cycle.rate].bounds;
-            for (member, e) in self.members.iter_mut().zip(&draws[..m]) {
-                let sd = if known { 0.0 } else { RATE_SD };
-                member.theta[cycle.rate] = (rate * (sd * e).exp()).clamp(low, high);
+            let sd = if known { 0.0 } else { RATE_SD };
+            for batch in &mut self.batches {
+                let draws = &draws[batch.first()..][..batch.len()];
+                for (value, e) in batch.theta[cycle.rate].0.iter_mut().zip(draws) {
+                    *value = (rate * (sd * e).exp()).clamp(low, high);
+                }
             }
         }
         let per_s = self.rate_hz().unwrap_or(0.0);
         let beats = self.cycles().unwrap_or(0.0);
         let there = beats + ahead_s * per_s;
         let target = if another { there.ceil() } else { there.round() } - ahead_s * per_s;
-        for (member, e) in self.members.iter_mut().zip(&draws[m..]) {
+        self.set_clocks(|i, phase| {
             // A new rhythm leaves nothing of what the members thought of the old one.
-            let own = if rate.is_some() { 0.0 } else { member.theta[cycle.phase] - beats };
-            let phase = target + own + if known { 0.0 } else { PHASE_SD * e };
-            self.model.set_clock(phase, &mut member.x, &mut member.theta);
-        }
+            let own = if rate.is_some() { 0.0 } else { phase - beats };
+            target + own + if known { 0.0 } else { PHASE_SD * draws[m + i] }
+        });
     }
 
     /// Moves all clocks alike, their mean to where `to` says.
     fn shift_clocks(&mut self, to: impl Fn(f64) -> f64) {
-        let (Some(cycle), Some(beats)) = (self.model.cycle(), self.cycles()) else { return };
+        let Some(beats) = self.cycles() else { return };
         let shift = to(beats) - beats;
-        for member in &mut self.members {
-            let phase = member.theta[cycle.phase] + shift;
-            self.model.set_clock(phase, &mut member.x, &mut member.theta);
+        self.set_clocks(|_, phase| phase + shift);
+    }
+
+    /// Sets the clock of every member to what `to` says of its index and phase.
+    fn set_clocks(&mut self, to: impl Fn(usize, f64) -> f64) {
+        let Some(cycle) = self.model.cycle() else { return };
+        let (mut x, mut theta) = (Vec::new(), Vec::new());
+        for batch in &mut self.batches {
+            for lane in 0..batch.len() {
+                read(&batch.x, lane, &mut x);
+                read(&batch.theta, lane, &mut theta);
+                let phase = to(batch.first() + lane, theta[cycle.phase]);
+                self.model.set_clock(phase, &mut x, &mut theta);
+                write(&mut batch.x, lane, &x);
+                write(&mut batch.theta, lane, &theta);
+            }
+            batch.fill_up();
         }
     }
 
@@ -134,6 +151,7 @@ impl<M: Model> Ensemble<M> {
 
     #[allow(clippy::cast_precision_loss)]
     fn mean_of(&self, parameter: usize) -> f64 {
-        self.parameter_of_members(parameter).sum::<f64>() / self.members.len() as f64
+        let of = |batch: &Batch| batch.theta[parameter].0[..batch.len()].iter().sum::<f64>();
+        self.batches.iter().map(of).sum::<f64>() / self.len() as f64
     }
 }

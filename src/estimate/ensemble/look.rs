@@ -1,8 +1,8 @@
-//! One window of `coupled`: what the members expect, how far off the samples are, what is learnt of that.
+//! One window of X-TFC: what the members expect, how far off the samples are, what is learnt of that.
 
 use super::{Ensemble, Observation, Parallel, WindowReport};
+use crate::estimate::batch::{SharedPrior, expectations};
 use crate::estimate::coupling::coupled;
-use crate::estimate::member::expectations;
 use crate::estimate::random::exact_normals;
 use crate::estimate::smoother::Correction;
 use crate::estimate::statistics::mean_and_sd;
@@ -45,19 +45,18 @@ impl<M: Model> Ensemble<M> {
             self.wander();
         }
         if observations.is_empty() {
-            return self.learn(observations, &[], &[], parallel);
+            return self.forecast(parallel);
         }
-        parallel.for_each(&mut self.members, &|_, member| {
-            member.forecast(&self.model, observations, &self.settings, 0.0);
-        });
-        let judged = self.judge(observations);
+        self.look_forward(observations, parallel);
+        let expected = expectations(&self.batches, observations.len());
+        let judged = self.judge(observations, &expected);
         if !self.listening {
-            let report = self.learn(&[], &[], &[], parallel);
+            let report = self.go_on(parallel);
             return WindowReport { innovations: judged.innovations, expected: judged.expected, ..report };
         }
-        let rows = self.rows();
-        let noise = exact_normals(observations.len(), self.members.len(), &rows, &mut self.rng);
-        coupled::covariance_root(&rows, self.members.len(), &mut self.root);
+        let (rows, m) = (self.rows(), self.len());
+        let noise = exact_normals(observations.len(), m, &rows, &mut self.rng, self.settings.instructions);
+        coupled::covariance_root(&rows, m, &mut self.root);
         let inflation = self.settings.drift.inflation.powf(h);
         if inflation > 1.0 {
             self.root.iter_mut().for_each(|r| *r *= inflation.sqrt());
@@ -66,19 +65,38 @@ impl<M: Model> Ensemble<M> {
             self.fix_parameters();
         }
         if self.settings.live.smoothing_lag_ns > 0 {
-            self.correct_the_past(observations, &judged.sd, &noise);
+            self.correct_the_past(observations, &expected, &judged.sd, &noise);
         }
-        let report = self.learn(observations, &judged.sd, &noise, parallel);
+        let root = std::mem::take(&mut self.root);
+        let covariance = coupled::square(&root, rows.len() / m);
+        let precision = coupled::precision(&coupled::covariance(&expected, &expected, m), &judged.sd);
+        let prior = SharedPrior { root: &root, covariance: &covariance, precision: &precision };
+        let report = self.learn(observations, (&judged.sd, &noise), Some(prior), parallel);
+        self.root = root;
         // Clocks stand at the end of the window by now.
         let clock = self.model.cycle().zip(self.cycles());
         for (j, o) in observations.iter().enumerate().filter(|_| !self.held) {
             let phase = clock.map(|(cycle, cycles)| {
-                let rate = self.members[0].theta[cycle.rate] / 60.0;
+                let rate = self.batches[0].theta[cycle.rate].0[0] / 60.0;
                 (cycles - (1.0 - o.s) * h * rate).rem_euclid(1.0)
             });
             let (residual, innovation) = (judged.residuals[j], judged.innovations[j]);
             self.fits[o.channel].hear(self.elapsed_s + o.s * h, phase, residual, judged.expected_sd[j], innovation);
         }
+        WindowReport { innovations: judged.innovations, expected: judged.expected, ..report }
+    }
+
+    /// One window of `independent`: every member for itself.
+    pub(super) fn independent_step(&mut self, observations: &[Observation], parallel: &dyn Parallel) -> WindowReport {
+        if observations.is_empty() {
+            return self.forecast(parallel);
+        }
+        self.look_forward(observations, parallel);
+        let expected = expectations(&self.batches, observations.len());
+        let judged = self.judge(observations, &expected);
+        let sd: Vec<f64> = observations.iter().map(|o| self.settings.channels[o.channel].noise_sd_mmhg).collect();
+        let noise = exact_normals(observations.len(), self.len(), &[], &mut self.rng, self.settings.instructions);
+        let report = self.learn(observations, (&sd, &noise), None, parallel);
         WindowReport { innovations: judged.innovations, expected: judged.expected, ..report }
     }
 
@@ -91,28 +109,25 @@ impl<M: Model> Ensemble<M> {
         }
     }
 
-    fn correct_the_past(&mut self, observations: &[Observation], sd: &[f64], noise: &[f64]) {
-        let m = self.members.len();
-        let expected = expectations(&self.members, sd.len());
+    fn correct_the_past(&mut self, observations: &[Observation], expected: &[f64], sd: &[f64], noise: &[f64]) {
+        let m = self.len();
         let off: Vec<f64> = expected
             .iter()
             .zip(noise)
             .enumerate()
             .map(|(k, (expected, e))| observations[k / m].value + sd[k / m] * e - expected)
             .collect();
-        if let Some(correction) = Correction::new(&expected, &off, sd, m) {
+        if let Some(correction) = Correction::new(expected, &off, sd, m) {
             // What is looked at again has corrected the times before it already.
             self.smoother.correct(&correction, self.second_look.unwrap_or(0));
         }
     }
 
     /// What the members expect of the samples, and how far off each sample is.
-    #[allow(clippy::cast_precision_loss)]
-    fn judge(&self, observations: &[Observation]) -> Judged {
+    fn judge(&self, observations: &[Observation], expected: &[f64]) -> Judged {
         let mut judged = Judged::default();
-        for (j, o) in observations.iter().enumerate() {
-            let expected: Vec<f64> = self.members.iter().map(|member| member.expected[j]).collect();
-            let (mean, spread) = mean_and_sd(&expected);
+        for (o, expected) in observations.iter().zip(expected.chunks_exact(self.len())) {
+            let (mean, spread) = mean_and_sd(expected);
             let stated = self.settings.channels[o.channel].noise_sd_mmhg;
             let noise = stated * self.fits[o.channel].noise_factor();
             let expected_sd = (spread * spread + noise * noise).sqrt();

@@ -2,7 +2,6 @@
 
 mod beats;
 mod clock;
-mod forecast;
 mod look;
 mod review;
 mod setup;
@@ -13,31 +12,32 @@ use rand_chacha::ChaCha8Rng;
 
 use self::beats::Beats;
 use self::clock::Edit;
-use self::forecast::Forecaster;
 use self::review::Memory;
 pub use self::setup::with_companions;
-use self::setup::{channel_fit, check, draw_bases};
+use self::setup::{channel_fit, check, draw_bases, varying};
 pub use self::summary::{ParameterSummary, Snapshot};
 use super::adapt::fit::ChannelFit;
 use super::adapt::pace::{Pace, diffusion};
+pub use super::batch::Batch;
+use super::batch::{Lesson, SharedPrior, Tools, gather, read};
 use super::coupling::{coupled_unknowns, independent_unknowns};
-pub use super::member::Member;
 use super::random::exact_normals;
 use super::rivals::Unscented;
 use super::settings::{CouplingKind, EstimatorSettings, SettingsError};
 use super::smoother::Smoother;
 use super::statistics::mean_and_sd;
+use crate::model::lanes::{Lanes, WIDTH};
 use crate::model::{Model, Transform};
-use crate::xtfc::problem::{Solution, Unknowns};
+use crate::xtfc::problem::Unknowns;
 
 /// A share of the prior variance that counts as learnt.
 const INFORMED: f64 = 1e-4;
 
-/// Runs a job for every member; the core does not know how. The job sees one member at a time and members do not see
-/// each other, so the order does not matter.
+/// Runs a job for every batch of members; the core does not know how. The job sees one batch at a time and members do not
+/// see each other, so the order does not matter.
 pub trait Parallel: Sync {
-    /// Calls `job(index, member)` for every member.
-    fn for_each(&self, members: &mut [Member], job: &(dyn Fn(usize, &mut Member) + Sync));
+    /// Calls `job(batch)` for every batch.
+    fn for_each(&self, batches: &mut [Batch], job: &(dyn Fn(&mut Batch) + Sync));
 
     /// Calls `job(index)` for every index below `count`.
     fn for_indices(&self, count: usize, job: &(dyn Fn(usize) + Sync));
@@ -48,8 +48,8 @@ pub trait Parallel: Sync {
 pub struct Serial;
 
 impl Parallel for Serial {
-    fn for_each(&self, members: &mut [Member], job: &(dyn Fn(usize, &mut Member) + Sync)) {
-        members.iter_mut().enumerate().for_each(|(i, member)| job(i, member));
+    fn for_each(&self, batches: &mut [Batch], job: &(dyn Fn(&mut Batch) + Sync)) {
+        batches.iter_mut().for_each(job);
     }
 
     fn for_indices(&self, count: usize, job: &(dyn Fn(usize) + Sync)) {
@@ -77,9 +77,11 @@ pub struct WindowReport {
     pub replaced: usize,
     /// Members whose iteration did not converge (but gave numbers).
     pub not_converged: usize,
+    /// Members that the kernels left to the general solver, or all where there are no kernels.
+    pub one_by_one: usize,
     /// Parameters put back to their bounds.
     pub clamped: usize,
-    /// Sum of the Gauss-Newton iterations over members.
+    /// Sum of the sweeps and Gauss-Newton iterations over members.
     pub iterations: usize,
     /// Root mean square over members of the physics residual \[mmHg/s\].
     pub physics_rms: f64,
@@ -101,8 +103,12 @@ pub struct Ensemble<M: Model> {
     /// What is estimated, the phase along with the heart rate.
     pub(super) estimated: Vec<usize>,
     pub(super) transforms: Vec<Transform>,
+    /// What is estimated, and what the model's clocks move.
+    varying: Vec<usize>,
     unknowns: Unknowns,
-    pub(super) members: Vec<Member>,
+    pub(super) batches: Vec<Batch>,
+    /// Equations for eight members at once; None where members are solved one by one.
+    lanes: Option<M::Lanes>,
     pub(super) rng: ChaCha8Rng,
     /// Shared prior root (`coupled`), `[n_u x n_u]`.
     root: Vec<f64>,
@@ -131,8 +137,6 @@ pub struct Ensemble<M: Model> {
     /// In order of time: those to come, and those of the last moments.
     edits: Vec<Edit>,
     applied: Vec<Edit>,
-    /// None where members are solved one by one.
-    forecaster: Option<Forecaster<M::Lanes>>,
     beats: Option<Beats>,
 }
 
@@ -154,17 +158,21 @@ impl<M: Model> Ensemble<M> {
             CouplingKind::Independent => independent_unknowns(&estimated),
             _ => coupled_unknowns(&model, &estimated, &transforms),
         };
+        let varying = varying(&model, &estimated, &settings.theta);
         let mut rng = ChaCha8Rng::seed_from_u64(settings.seed);
         let mut theta = settings.theta.clone();
         model.advance(start_s, &mut theta);
 
         let (n, m) = (model.n_states(), settings.members);
         let bases = draw_bases(&model, &settings, &mut rng, parallel)?;
-        let draws = exact_normals(n + estimated.len(), m, &[], &mut rng);
+        let draws = exact_normals(n + estimated.len(), m, &[], &mut rng, settings.instructions);
         let (states, guesses) = draws.split_at(n * m);
         let centre: Vec<f64> = estimated.iter().zip(&transforms).map(|(&p, t)| t.forward(theta[p])).collect();
-        let members = bases.into_iter().enumerate().map(|(i, basis)| {
+        let state = |i: usize| {
             let x = (0..n).map(|s| settings.initial_state[s] + settings.initial_state_sd[s] * states[s * m + i]);
+            x.collect::<Vec<f64>>()
+        };
+        let parameters = |i: usize| {
             let mut theta = theta.clone();
             if settings.coupling.is_bayesian() {
                 for (k, &p) in estimated.iter().enumerate() {
@@ -172,9 +180,16 @@ impl<M: Model> Ensemble<M> {
                     theta[p] = belief.value(transforms[k], centre[k] + belief.sd * guesses[k * m + i]);
                 }
             }
-            Member::new(basis, x.collect(), theta)
-        });
-        let members = members.collect();
+            theta
+        };
+        let mut bases = bases.into_iter();
+        let batch = |first: usize| {
+            let members = first..(first + WIDTH).min(m);
+            let bases = bases.by_ref().take(members.len()).collect();
+            let (xs, thetas): (Vec<_>, Vec<_>) = members.map(|i| (state(i), parameters(i))).unzip();
+            Batch::new(first, bases, &xs, &thetas)
+        };
+        let batches = (0..m).step_by(WIDTH).map(batch).collect();
         let pace = |(&p, centre): (&usize, &f64)| {
             let belief = &settings.beliefs[p];
             Pace::new(belief.drift, belief.reversion, *centre, belief.sd)
@@ -182,9 +197,11 @@ impl<M: Model> Ensemble<M> {
         let mut ensemble = Self {
             paces: estimated.iter().zip(&centre).map(pace).collect(),
             fits: settings.channels.iter().map(|c| channel_fit(&settings, c)).collect(),
-            members,
+            batches,
+            lanes: model.lanes().filter(|_| settings.coupling.is_xtfc()),
             model,
             settings,
+            varying,
             estimated,
             transforms,
             unknowns,
@@ -205,17 +222,12 @@ impl<M: Model> Ensemble<M> {
             clock_waits: false,
             edits: Vec::new(),
             applied: Vec::new(),
-            forecaster: None,
             beats: None,
         };
-        if ensemble.settings.coupling.is_xtfc() {
-            let instructions = ensemble.settings.instructions;
-            let forecaster = |lanes| Forecaster::new(lanes, instructions, &ensemble.members);
-            ensemble.forecaster = ensemble.model.lanes().map(forecaster);
-        }
         ensemble.initial_sd = (0..ensemble.estimated.len()).map(|k| ensemble.coordinate(k).1).collect();
         if ensemble.settings.coupling == CouplingKind::Ukf {
-            ensemble.unscented = Some(Unscented::new(&ensemble.rows(), m, &mut ensemble.rng));
+            ensemble.unscented =
+                Some(Unscented::new(&ensemble.rows(), m, &mut ensemble.rng, ensemble.settings.instructions));
         }
         Ok(ensemble)
     }
@@ -232,12 +244,12 @@ impl<M: Model> Ensemble<M> {
 
     /// Number of members.
     pub fn len(&self) -> usize {
-        self.members.len()
+        self.settings.members
     }
 
     /// Never true of a constructed ensemble.
     pub fn is_empty(&self) -> bool {
-        self.members.is_empty()
+        self.batches.is_empty()
     }
 
     /// How a channel fits.
@@ -250,12 +262,7 @@ impl<M: Model> Ensemble<M> {
         let h = self.settings.window.length_s();
         let report = match self.settings.coupling {
             CouplingKind::Coupled => self.coupled_step(observations, h, parallel),
-            CouplingKind::Independent => {
-                let sd: Vec<f64> =
-                    observations.iter().map(|o| self.settings.channels[o.channel].noise_sd_mmhg).collect();
-                let noise = exact_normals(observations.len(), self.members.len(), &[], &mut self.rng);
-                self.learn(observations, &sd, &noise, parallel)
-            }
+            CouplingKind::Independent => self.independent_step(observations, parallel),
             CouplingKind::Enkf => self.enkf_step(observations, h, parallel),
             CouplingKind::Ukf => self.ukf_step(observations, h),
         };
@@ -280,31 +287,6 @@ impl<M: Model> Ensemble<M> {
     /// Whether samples are learnt from; otherwise they are only compared with what is expected.
     pub fn listen(&mut self, listening: bool) {
         self.listening = listening;
-    }
-
-    /// One window of X-TFC for every member, with what it says of the parameters.
-    fn learn(
-        &mut self,
-        observations: &[Observation],
-        sd: &[f64],
-        noise: &[f64],
-        parallel: &dyn Parallel,
-    ) -> WindowReport {
-        if observations.is_empty() {
-            self.forecast(parallel);
-            return self.account(0);
-        }
-        let before = self.coordinates();
-        let Self { model, settings, unknowns, members, root, .. } = self;
-        let (model, settings, unknowns, root) = (&*model, &*settings, &*unknowns, &*root);
-        let m = members.len();
-        parallel.for_each(members, &|i, member| {
-            member.perturb(observations, settings, sd, |k| noise[k * m + i]);
-            member.solve(model, settings, unknowns, root);
-        });
-        let mut report = self.account(observations.len());
-        report.informed = self.compare(&before);
-        report
     }
 
     /// Whether the window said something about each estimated parameter; tells the paces what it said.
@@ -357,33 +339,50 @@ impl<M: Model> Ensemble<M> {
             })
             .filter(|(_, keep, sd)| *sd > 0.0 || *keep < 1.0)
             .collect();
-        let m = self.members.len();
-        let draws = exact_normals(states.len() + parameters.len(), m, &self.rows(), &mut self.rng);
+        let m = self.len();
+        let draws =
+            exact_normals(states.len() + parameters.len(), m, &self.rows(), &mut self.rng, self.settings.instructions);
         for (row, &(state, sd)) in draws.chunks_exact(m).zip(&states) {
-            self.members.iter_mut().zip(row).for_each(|(member, e)| member.x[state] += sd * e);
+            self.add_to_state(state, sd, row);
         }
         for (row, &(k, keep, sd)) in draws.chunks_exact(m).skip(states.len()).zip(&parameters) {
             let (p, transform, centre) = (self.estimated[k], self.transforms[k], self.centre[k]);
             let belief = &self.settings.beliefs[p];
-            for (member, e) in self.members.iter_mut().zip(row) {
-                let u = centre + keep * (transform.forward(member.theta[p]) - centre) + sd * e;
-                member.theta[p] = belief.value(transform, u);
+            for batch in &mut self.batches {
+                let draws = &row[batch.first()..][..batch.len()];
+                let u = coordinates(batch.theta[p], transform);
+                for (lane, e) in draws.iter().enumerate() {
+                    let u = centre + keep * (u.0[lane] - centre) + sd * e;
+                    batch.theta[p].0[lane] = belief.value(transform, u);
+                }
+                batch.fill_up();
             }
+        }
+    }
+
+    /// Adds `sd` times the draws of the members to a state.
+    fn add_to_state(&mut self, state: usize, sd: f64, draws: &[f64]) {
+        for batch in &mut self.batches {
+            let draws = &draws[batch.first()..][..batch.len()];
+            batch.x[state].0.iter_mut().zip(draws).for_each(|(x, e)| *x += sd * e);
+            batch.fill_up();
         }
     }
 
     /// States and parameter coordinates of the members now, `[n_u x n_members]`.
     pub(super) fn rows(&self) -> Vec<f64> {
-        self.rows_of(&self.members)
+        self.rows_of(&self.batches)
     }
 
-    pub(super) fn rows_of(&self, members: &[Member]) -> Vec<f64> {
-        let n = self.model.n_states();
-        let states = (0..n).flat_map(|s| members.iter().map(move |member| member.x[s]));
-        let parameters = self.estimated.iter().zip(&self.transforms);
-        states
-            .chain(parameters.flat_map(|(&p, t)| members.iter().map(move |member| t.forward(member.theta[p]))))
-            .collect()
+    pub(super) fn rows_of(&self, batches: &[Batch]) -> Vec<f64> {
+        let mut rows = Vec::with_capacity((self.model.n_states() + self.estimated.len()) * batches.len() * WIDTH);
+        for state in 0..self.model.n_states() {
+            gather(batches, &mut rows, |batch| batch.x[state]);
+        }
+        for (&p, transform) in self.estimated.iter().zip(&self.transforms) {
+            gather(batches, &mut rows, |batch| coordinates(batch.theta[p], *transform));
+        }
+        rows
     }
 
     /// Mean and standard deviation of every estimated coordinate.
@@ -391,100 +390,120 @@ impl<M: Model> Ensemble<M> {
         (0..self.estimated.len()).map(|k| self.coordinate(k)).collect()
     }
 
-    /// Moves the members on, mends those without numbers, and sums up.
-    fn account(&mut self, observations: usize) -> WindowReport {
-        let mut report =
-            WindowReport { solved: self.members.iter().filter(|m| m.solved).count(), ..Default::default() };
-        let h = self.settings.window.length_s();
+    /// One batch after the other or side by side.
+    pub(super) fn each(&mut self, parallel: &dyn Parallel, job: impl Fn(&Tools<'_, M>, &mut Batch) + Sync) {
+        let Self { model, lanes, settings, unknowns, varying, batches, .. } = self;
+        let tools = Tools { model, lanes: lanes.as_ref(), settings, unknowns, varying };
+        parallel.for_each(batches, &|batch| job(&tools, batch));
+    }
+
+    /// Every member through the window as if there were no samples, and what that says of them.
+    fn look_forward(&mut self, observations: &[Observation], parallel: &dyn Parallel) {
+        self.each(parallel, |tools, batch| {
+            batch.forecast(tools);
+            batch.expect(observations, tools.settings);
+        });
+    }
+
+    /// A window that nothing is learnt from.
+    fn forecast(&mut self, parallel: &dyn Parallel) -> WindowReport {
+        let (h, estimated) = (self.clock_step_s(), self.estimated.clone());
+        self.each(parallel, |tools, batch| {
+            batch.forecast(tools);
+            batch.move_on(tools, &estimated, h);
+        });
+        self.account()
+    }
+
+    /// To the end of a window that was looked through already.
+    fn go_on(&mut self, parallel: &dyn Parallel) -> WindowReport {
+        let (h, estimated) = (self.clock_step_s(), self.estimated.clone());
+        self.each(parallel, |tools, batch| batch.move_on(tools, &estimated, h));
+        self.account()
+    }
+
+    /// Learns from the samples, after a look forward.
+    fn learn(
+        &mut self,
+        observations: &[Observation],
+        (sd, noise): (&[f64], &[f64]),
+        shared: Option<SharedPrior<'_>>,
+        parallel: &dyn Parallel,
+    ) -> WindowReport {
+        let before = self.coordinates();
+        let (h, estimated) = (self.clock_step_s(), self.estimated.clone());
+        let lesson = Lesson { observations, sd, noise, members: self.len(), shared };
+        self.each(parallel, |tools, batch| {
+            batch.fit(tools, &lesson);
+            batch.move_on(tools, &estimated, h);
+        });
+        let mut report = self.account();
+        report.informed = self.compare(&before);
+        report
+    }
+
+    /// What clocks move on by in a window.
+    fn clock_step_s(&self) -> f64 {
+        if self.clock_waits { 0.0 } else { self.settings.window.length_s() }
+    }
+
+    /// Mends the members without numbers, and sums up.
+    fn account(&mut self) -> WindowReport {
+        let mut report = WindowReport::default();
         let mut squares = 0.0;
-        for member in &mut self.members {
-            let h = if self.clock_waits { 0.0 } else { h };
-            if !member.solved {
-                self.model.advance(h, &mut member.theta);
-                continue;
-            }
-            let account = member.solution.account;
-            report.iterations += account.iterations;
-            report.not_converged += usize::from(!account.converged);
-            squares += account.physics_rms * account.physics_rms;
-            member.x.clone_from(&member.solution.end);
-            member.theta.clone_from(&member.solution.theta);
-            for &p in &self.estimated {
-                let (low, high) = self.settings.beliefs[p].bounds;
-                let inside = member.theta[p].clamp(low, high);
-                report.clamped += usize::from(inside.to_bits() != member.theta[p].to_bits());
-                member.theta[p] = inside;
-            }
-            self.model.advance(h, &mut member.theta);
+        for batch in &self.batches {
+            let tally = batch.tally;
+            report.solved += batch.solved[..batch.len()].iter().filter(|solved| **solved).count();
+            report.iterations += tally.iterations;
+            report.not_converged += tally.not_converged;
+            report.clamped += tally.clamped;
+            report.one_by_one += tally.one_by_one;
+            squares += tally.squares;
         }
         #[allow(clippy::cast_precision_loss)]
         if report.solved > 0 {
             report.physics_rms = (squares / report.solved as f64).sqrt();
         }
-        // `coupled` has compared the samples with what it expected before it solved.
-        if self.settings.coupling == CouplingKind::Independent {
-            report.innovations = self.innovations(observations);
-        }
-        report.replaced = self.replace_failed();
+        report.replaced = self.replace_failed(report.solved);
         report
     }
 
-    /// Normalised innovation per observation, from the members' own account of them.
-    #[allow(clippy::cast_precision_loss)]
-    fn innovations(&self, observations: usize) -> Vec<f64> {
-        let told: Vec<&Solution> = self
-            .members
-            .iter()
-            .filter(|member| member.solved && member.solution.innovations.len() == observations)
-            .map(|member| &member.solution)
-            .collect();
-        let count = told.len() as f64;
-        (0..observations)
-            .map(|j| {
-                let residual: f64 = told.iter().map(|s| s.innovations[j].0).sum::<f64>() / count;
-                let variance: f64 = told.iter().map(|s| s.innovations[j].1).sum::<f64>() / count;
-                residual / variance.sqrt()
-            })
-            .collect()
-    }
-
     /// Gives a failed member the place of a living one, and its features.
-    fn replace_failed(&mut self) -> usize {
-        let living: Vec<usize> = (0..self.members.len()).filter(|&i| self.members[i].solved).collect();
-        if living.len() == self.members.len() || living.is_empty() {
+    fn replace_failed(&mut self, solved: usize) -> usize {
+        if solved == self.len() || solved == 0 {
             return 0;
         }
-        let mut replaced = 0;
-        for i in 0..self.members.len() {
-            if self.members[i].solved {
-                continue;
-            }
+        let is_living = |i: &usize| self.batches[i / WIDTH].solved[i % WIDTH];
+        let (living, failed): (Vec<usize>, Vec<usize>) = (0..self.len()).partition(is_living);
+        for (replaced, &i) in failed.iter().enumerate() {
             // Deterministic and different from failure to failure: walk through the living.
-            let donor = self.members[living[(i + replaced) % living.len()]].clone();
-            let member = &mut self.members[i];
-            member.x = donor.x;
-            member.theta = donor.theta;
-            member.solution.clone_from(&donor.solution);
-            // Coefficients belong to the donor's basis.
-            member.basis = donor.basis;
-            member.solved = true;
-            replaced += 1;
+            let donor = living[(i + replaced) % living.len()];
+            let copy = self.batches[donor / WIDTH].clone();
+            self.batches[i / WIDTH].replace(i % WIDTH, (&copy, donor % WIDTH));
         }
-        if let Some(forecaster) = &mut self.forecaster {
-            forecaster.renew(&self.members);
-        }
-        replaced
+        failed.len()
     }
 
     /// Mean and standard deviation over the members of an estimated coordinate.
     fn coordinate(&self, k: usize) -> (f64, f64) {
+        let mut values = Vec::with_capacity(self.len());
         let (p, transform) = (self.estimated[k], self.transforms[k]);
-        let values: Vec<f64> = self.members.iter().map(|member| transform.forward(member.theta[p])).collect();
+        gather(&self.batches, &mut values, |batch| coordinates(batch.theta[p], transform));
         mean_and_sd(&values)
     }
 
     /// All parameters of a member at the end of the last window.
-    pub fn theta_of(&self, member: usize) -> &[f64] {
-        &self.members[member].theta
+    pub fn theta_of(&self, member: usize) -> Vec<f64> {
+        let mut theta = Vec::new();
+        read(&self.batches[member / WIDTH].theta, member % WIDTH, &mut theta);
+        theta
+    }
+}
+
+/// The coordinates of parameters.
+fn coordinates(theta: Lanes, transform: Transform) -> Lanes {
+    match transform {
+        Transform::Log => theta.ln(),
+        Transform::Linear { scale } => theta / Lanes::splat(scale),
     }
 }

@@ -9,6 +9,7 @@ use crate::estimate::beat::BeatFollower;
 use crate::estimate::time::EventTime;
 use crate::estimate::timing::TimingSource;
 use crate::model::Model;
+use crate::model::lanes::Lanes;
 
 /// Spacing of the checkpoints \[s\], and how many are kept.
 const CHECKPOINT_S: f64 = 0.1;
@@ -24,8 +25,8 @@ const LOOK_BACK_S: f64 = 0.4;
 /// The ensemble as it was.
 #[derive(Debug, Clone)]
 pub(super) struct Checkpoint {
-    /// States and parameters.
-    members: Vec<(Vec<f64>, Vec<f64>)>,
+    /// States and parameters, batch by batch.
+    members: Vec<(Vec<Lanes>, Vec<Lanes>)>,
     fits: Vec<ChannelFit>,
     paces: Vec<Pace>,
     wander_due_s: f64,
@@ -140,7 +141,7 @@ impl<M: Model> Ensemble<M> {
 
     fn checkpoint(&self) -> Checkpoint {
         Checkpoint {
-            members: self.members.iter().map(|member| (member.x.clone(), member.theta.clone())).collect(),
+            members: self.batches.iter().map(|batch| (batch.x.clone(), batch.theta.clone())).collect(),
             fits: self.fits.clone(),
             paces: self.paces.clone(),
             wander_due_s: self.wander_due_s,
@@ -152,9 +153,9 @@ impl<M: Model> Ensemble<M> {
     }
 
     fn restore(&mut self, checkpoint: &Checkpoint) {
-        for (member, (x, theta)) in self.members.iter_mut().zip(&checkpoint.members) {
-            member.x.clone_from(x);
-            member.theta.clone_from(theta);
+        for (batch, (x, theta)) in self.batches.iter_mut().zip(&checkpoint.members) {
+            batch.x.clone_from(x);
+            batch.theta.clone_from(theta);
         }
         self.fits.clone_from(&checkpoint.fits);
         self.wander_due_s = checkpoint.wander_due_s;

@@ -74,14 +74,23 @@ pub fn with_companions<M: Model>(model: &M, estimate: &[usize]) -> Vec<usize> {
     all
 }
 
+/// Parameters that change: what is estimated, what makes the model periodic, and what its clocks move.
+pub(super) fn varying<M: Model>(model: &M, estimated: &[usize], theta: &[f64]) -> Vec<usize> {
+    let mut later = theta.to_vec();
+    model.advance(1.0, &mut later);
+    let clock = |p: usize| later[p].to_bits() != theta[p].to_bits();
+    let cycle = |p: usize| model.cycle().is_some_and(|cycle| cycle.phase == p || cycle.rate == p);
+    (0..theta.len()).filter(|&p| estimated.contains(&p) || cycle(p) || clock(p)).collect()
+}
+
 pub(super) fn draw_bases<M: Model>(
     model: &M,
     settings: &EstimatorSettings,
     rng: &mut ChaCha8Rng,
     parallel: &dyn Parallel,
-) -> Result<Vec<Option<Basis>>, SettingsError> {
+) -> Result<Vec<Basis>, SettingsError> {
     if !settings.coupling.is_xtfc() {
-        return Ok(vec![None; settings.members]);
+        return Ok(Vec::new());
     }
     let length_s = settings.window.length_s();
     let free = (0..model.n_states()).any(|state| model.is_free(state));
@@ -103,5 +112,5 @@ pub(super) fn draw_bases<M: Model>(
         let mut draws = (0..MAX_REDRAWS).map(|_| basis(&RandomFeatures::draw(settings.features, rng)?));
         draws.find(Result::is_ok).unwrap_or(Err(FeatureError::Degenerate))
     };
-    slots.into_iter().map(|slot| Ok(Some(slot.into_inner().map_or_else(&mut again, Ok)?))).collect()
+    slots.into_iter().map(|slot| Ok(slot.into_inner().map_or_else(&mut again, Ok)?)).collect()
 }

@@ -1,11 +1,12 @@
 //! What the members say together.
 
-use super::Ensemble;
-use crate::estimate::member::Member;
+use super::{Ensemble, coordinates};
+use crate::estimate::batch::{Tools, read};
 use crate::estimate::smoother::Remembered;
 use crate::estimate::statistics::{Explainers, Summary, mean_and_sd, summarise};
 use crate::estimate::time::EventTime;
 use crate::model::Model;
+use crate::model::lanes::Lanes;
 
 /// A parameter is identifiable when data have brought its sd to less than a third of that it started with.
 const IDENTIFIABLE: f64 = 0.9;
@@ -33,28 +34,33 @@ impl ParameterSummary {
 #[derive(Debug, Clone, Default)]
 pub struct Snapshot {
     values: Vec<f64>,
-    row: Vec<f64>,
-    phi: Vec<f64>,
+    x: Vec<Lanes>,
+    derived: Vec<Lanes>,
 }
 
 impl<M: Model> Ensemble<M> {
     /// States and derived quantities of all members at position `s` of the last window, `[n_quantities x n_members]`,
     /// states first.
     pub fn snapshot<'a>(&self, s: f64, scratch: &'a mut Snapshot) -> &'a mut [f64] {
-        let (n, m) = (self.model.n_states(), self.members.len());
+        let (n, m) = (self.model.n_states(), self.len());
         let n_q = n + self.model.derived().len();
-        scratch.values.resize(n_q * m, 0.0);
-        scratch.row.resize(n_q, 0.0);
         let t = s * self.settings.window.length_s();
-        for (i, member) in self.members.iter().enumerate() {
-            let (x, derived) = scratch.row.split_at_mut(n);
-            member.state_at(&self.model, s, &mut scratch.phi, x);
-            self.model.derive(t, x, &member.solution.theta, derived);
-            for (q, value) in scratch.row.iter().enumerate() {
-                scratch.values[q * m + i] = *value;
+        scratch.values.resize(n_q * m, 0.0);
+        let tools = self.tools();
+        for batch in &self.batches {
+            batch.states_at(&self.model, s, &mut scratch.x);
+            batch.derive_at(&tools, t, &scratch.x, &mut scratch.derived);
+            let rows = scratch.values.chunks_exact_mut(m);
+            for (row, lanes) in rows.zip(scratch.x.iter().chain(&scratch.derived)) {
+                row[batch.first()..][..batch.len()].copy_from_slice(&lanes.0[..batch.len()]);
             }
         }
         &mut scratch.values
+    }
+
+    pub(in crate::estimate) fn tools(&self) -> Tools<'_, M> {
+        let Self { model, lanes, settings, unknowns, varying, .. } = self;
+        Tools { model, lanes: lanes.as_ref(), settings, unknowns, varying }
     }
 
     /// One summary per quantity of [`Ensemble::snapshot`].
@@ -64,7 +70,7 @@ impl<M: Model> Ensemble<M> {
 
     /// One summary per row of `values` `[n_quantities x n_members]`, states first, where the clock says `cycles`.
     fn summarise(&self, values: &mut [f64], cycles: Option<f64>) -> Vec<Summary> {
-        let (n, m) = (self.model.n_states(), self.members.len());
+        let (n, m) = (self.model.n_states(), self.len());
         let explainers = Explainers::new(&values[(n - self.model.n_discrepancies()) * m..n * m], m);
         let noise = |q: usize| self.settings.aleatoric_sd_mmhg.get(q).copied().unwrap_or(0.0);
         let phase = cycles.map(|cycles| cycles.rem_euclid(1.0));
@@ -80,14 +86,14 @@ impl<M: Model> Ensemble<M> {
     }
 
     /// A parameter of every member at the end of the last window.
-    pub fn parameter_of_members(&self, parameter: usize) -> impl ExactSizeIterator<Item = f64> + '_ {
-        self.members.iter().map(move |member| member.theta[parameter])
+    pub fn parameter_of_members(&self, parameter: usize) -> impl Iterator<Item = f64> + '_ {
+        self.batches.iter().flat_map(move |batch| batch.theta[parameter].0.into_iter().take(batch.len()))
     }
 
     /// The estimated parameters at the end of the last window.
     pub fn summarise_parameters(&self) -> Vec<ParameterSummary> {
         let summary = |(k, &p): (usize, &usize)| {
-            let mut values: Vec<f64> = self.members.iter().map(|member| member.theta[p]).collect();
+            let mut values: Vec<f64> = self.parameter_of_members(p).collect();
             self.parameter_summary(k, &mut values, self.coordinate(k).1)
         };
         self.estimated.iter().enumerate().map(summary).collect()
@@ -105,10 +111,14 @@ impl<M: Model> Ensemble<M> {
     /// States and estimated parameters of every member at the end of the last window,
     /// `[n_members x (n_states + n_estimated)]`.
     pub fn members_at_end(&self) -> Vec<f64> {
-        let row = |member: &Member| -> Vec<f64> {
-            member.x.iter().copied().chain(self.estimated.iter().map(|&p| member.theta[p])).collect()
-        };
-        self.members.iter().flat_map(row).collect()
+        let mut out = Vec::with_capacity(self.len() * (self.model.n_states() + self.estimated.len()));
+        for batch in &self.batches {
+            for lane in 0..batch.len() {
+                out.extend(batch.x.iter().map(|x| x.0[lane]));
+                out.extend(self.estimated.iter().map(|&p| batch.theta[p].0[lane]));
+            }
+        }
+        out
     }
 
     /// Keeps the members at position `s` of the last window, to be corrected by what comes.
@@ -120,30 +130,33 @@ impl<M: Model> Ensemble<M> {
 
     /// The members at a moment of the last window.
     pub(super) fn fill(&self, moment: &mut Remembered) {
-        let (n, m) = (self.model.n_states(), self.members.len());
+        // States and parameters of every batch.
+        let mut at: Vec<[Vec<Lanes>; 2]> = Vec::with_capacity(self.batches.len());
+        for batch in &self.batches {
+            let mut x = Vec::new();
+            batch.states_at(&self.model, moment.s, &mut x);
+            let ahead_s = moment.s * self.settings.window.length_s();
+            at.push([x, batch.parameters_at(&self.tools(), ahead_s)]);
+        }
         moment.rows.clear();
-        moment.rows.resize((n + self.estimated.len()) * m, 0.0);
-        let mut x = vec![0.0; n];
-        let mut phi = Vec::new();
-        let ahead_s = moment.s * self.settings.window.length_s();
-        for (i, member) in self.members.iter().enumerate() {
-            member.state_at(&self.model, moment.s, &mut phi, &mut x);
-            x.iter().enumerate().for_each(|(s, x)| moment.rows[s * m + i] = *x);
-            let mut theta = member.solution.theta.clone();
-            self.model.advance(ahead_s, &mut theta);
-            for (k, &p) in self.estimated.iter().enumerate() {
-                moment.rows[(n + k) * m + i] = self.transforms[k].forward(theta[p]);
+        let mut row = |of: &dyn Fn(&[Vec<Lanes>; 2]) -> Lanes| {
+            for (batch, at) in self.batches.iter().zip(&at) {
+                moment.rows.extend_from_slice(&of(at).0[..batch.len()]);
             }
-            if i == 0 {
-                moment.theta = theta;
-            }
+        };
+        (0..self.model.n_states()).for_each(|s| row(&|[x, _]| x[s]));
+        for (&p, transform) in self.estimated.iter().zip(&self.transforms) {
+            row(&|[_, theta]| coordinates(theta[p], *transform));
+        }
+        if let Some([_, theta]) = at.first() {
+            read(theta, 0, &mut moment.theta);
         }
     }
 
     /// The oldest remembered moment that is not after `until`: its time, a summary per quantity and per parameter.
     pub fn smoothed(&mut self, until: EventTime) -> Option<(EventTime, Vec<Summary>, Vec<ParameterSummary>)> {
         let moment = self.smoother.release(until)?;
-        let (n, m) = (self.model.n_states(), self.members.len());
+        let (n, m) = (self.model.n_states(), self.len());
         let n_d = self.model.derived().len();
         let mut values = vec![0.0; (n + n_d) * m];
         let mut parameters = vec![0.0; self.estimated.len() * m];
