@@ -75,8 +75,10 @@ impl Estimate {
         let seconds = check_record(input, &config)?;
         let reader = Record::open(input, &config)?;
         let mut run = Run::new(&config, self, &reader, seconds)?;
-        run.record(reader, &workers)?;
-        run.finish(&workers)
+        workers.install(|| {
+            run.record(reader, &workers)?;
+            run.finish(&workers)
+        })
     }
 }
 

@@ -22,8 +22,11 @@ pub struct BeatFollower {
     last: Option<(EventTime, f64)>,
     /// Onset of the beat under way \[s\]; None before the first onset seen.
     onset_s: Option<f64>,
-    /// `[n_quantities x n_members]`; `mean` is the integral so far, `change` the value at the start.
-    extents: Vec<Extent>,
+    /// What every quantity of every member did so far, `[n_quantities x n_members]`.
+    smallest: Vec<f64>,
+    largest: Vec<f64>,
+    integral: Vec<f64>,
+    first: Vec<f64>,
     /// How far the clock of each member was ahead of that of the ensemble at the start \[beats\].
     ahead: Vec<f64>,
 }
@@ -53,13 +56,21 @@ impl BeatFollower {
             over = self.onset_s.map(|start_s| self.read(model, (start_s, onset_s), (values, &ahead), theta));
             self.ahead = ahead;
             self.onset_s = Some(onset_s);
-            self.extents.clear();
-            self.extents.extend(values.iter().map(|v| Extent { change: *v, ..Extent::EMPTY }));
+            for rows in [&mut self.smallest, &mut self.largest, &mut self.first] {
+                rows.clear();
+                rows.extend_from_slice(values);
+            }
+            self.integral.clear();
+            self.integral.resize(values.len(), 0.0);
         }
-        for (extent, value) in self.extents.iter_mut().zip(values) {
-            extent.min = extent.min.min(*value);
-            extent.max = extent.max.max(*value);
-            extent.mean += value * dt_s;
+        for (smallest, value) in self.smallest.iter_mut().zip(values) {
+            *smallest = if *value < *smallest { *value } else { *smallest };
+        }
+        for (largest, value) in self.largest.iter_mut().zip(values) {
+            *largest = if *value > *largest { *value } else { *largest };
+        }
+        for (integral, value) in self.integral.iter_mut().zip(values) {
+            *integral += value * dt_s;
         }
         over
     }
@@ -72,14 +83,15 @@ impl BeatFollower {
         theta: &dyn Fn(usize) -> Vec<f64>,
     ) -> BeatEstimate {
         let n_q = model.n_states() + model.derived().len();
-        let members = self.extents.len() / n_q;
+        let members = self.first.len() / n_q;
         let duration_s = end_s - start_s;
         let mut read = vec![0.0; model.clinical().len() * members];
         let mut row = vec![0.0; model.clinical().len()];
         for i in 0..members {
             let whole = |q: usize| {
-                let extent = self.extents[q * members + i];
-                Extent { mean: extent.mean / duration_s, change: values[q * members + i] - extent.change, ..extent }
+                let at = q * members + i;
+                let (min, max, mean) = (self.smallest[at], self.largest[at], self.integral[at] / duration_s);
+                Extent { min, max, mean, change: values[at] - self.first[at] }
             };
             let (states, derived): (Vec<_>, Vec<_>) =
                 ((0..model.n_states()).map(whole).collect(), (model.n_states()..n_q).map(whole).collect());

@@ -10,7 +10,8 @@
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use crate::model::lanes::{InstructionSet, WIDTH};
+use super::statistics::{dot, sum};
+use crate::model::lanes::InstructionSet;
 
 /// Rows over the members, as an orthonormal and centred set.
 #[derive(Debug, Clone, Default)]
@@ -42,7 +43,13 @@ impl Directions {
 
     /// Centres `row` `[n_members]` and takes the directions out of it; returns what is left of its length, as a share.
     pub fn reduce(&self, row: &mut [f64]) -> f64 {
-        self.instructions.run(Reduction { directions: &self.rows, row })
+        // Twice, because once is not orthogonal to rounding.
+        self.instructions.run(Reduction { directions: &self.rows, row, passes: 2 })
+    }
+
+    /// The same for a random row, of which the directions are a small part: once is enough.
+    fn reduce_random(&self, row: &mut [f64]) {
+        self.instructions.run(Reduction { directions: &self.rows, row, passes: 1 });
     }
 
     /// Adds what `row` has beyond the directions known; nothing if that is rounding.
@@ -72,6 +79,7 @@ impl Directions {
 struct Reduction<'a> {
     directions: &'a [f64],
     row: &'a mut [f64],
+    passes: usize,
 }
 
 #[allow(clippy::inline_always)]
@@ -81,12 +89,11 @@ impl pulp::NullaryFnOnce for Reduction<'_> {
     #[allow(clippy::cast_precision_loss)]
     #[inline(always)]
     fn call(self) -> f64 {
-        let Self { directions, row } = self;
+        let Self { directions, row, passes } = self;
         let mean = sum(row, |v| v) / row.len() as f64;
         row.iter_mut().for_each(|v| *v -= mean);
         let before = length(row);
-        // Twice, because once is not orthogonal to rounding.
-        for _ in 0..2 {
+        for _ in 0..passes {
             for direction in directions.chunks_exact(row.len().max(1)) {
                 let along = dot(direction, row);
                 row.iter_mut().zip(direction).for_each(|(r, d)| *r -= along * d);
@@ -94,34 +101,6 @@ impl pulp::NullaryFnOnce for Reduction<'_> {
         }
         if before > 0.0 { length(row) / before } else { 0.0 }
     }
-}
-
-// Sums in eight parts, whatever the instruction set: the same bits everywhere.
-
-#[allow(clippy::inline_always)]
-#[inline(always)]
-fn sum(row: &[f64], of: impl Fn(f64) -> f64) -> f64 {
-    let (whole, rest) = row.as_chunks::<WIDTH>();
-    let mut parts = [0.0; WIDTH];
-    for chunk in whole {
-        for (part, v) in parts.iter_mut().zip(chunk) {
-            *part += of(*v);
-        }
-    }
-    parts.iter().sum::<f64>() + rest.iter().map(|v| of(*v)).sum::<f64>()
-}
-
-#[allow(clippy::inline_always)]
-#[inline(always)]
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let ((whole_a, rest_a), (whole_b, rest_b)) = (a.as_chunks::<WIDTH>(), b.as_chunks::<WIDTH>());
-    let mut parts = [0.0; WIDTH];
-    for (a, b) in whole_a.iter().zip(whole_b) {
-        for ((part, a), b) in parts.iter_mut().zip(a).zip(b) {
-            *part += a * b;
-        }
-    }
-    parts.iter().sum::<f64>() + rest_a.iter().zip(rest_b).map(|(a, b)| a * b).sum::<f64>()
 }
 
 #[allow(clippy::inline_always)]
@@ -152,7 +131,7 @@ pub fn exact_normals<R: Rng>(
         let at = out.len();
         out.extend((0..members).map(|_| -> f64 { StandardNormal.sample(rng) }));
         let row = &mut out[at..];
-        taken.reduce(row);
+        taken.reduce_random(row);
         let length = length(row);
         if length > 0.0 {
             row.iter_mut().for_each(|v| *v *= target / length);

@@ -1,9 +1,6 @@
 //! A fixed pool of threads for the solves.
 
-use rayon::iter::{
-    IndexedParallelIterator, IntoParallelIterator, IntoParallelRefIterator, IntoParallelRefMutIterator,
-    ParallelIterator,
-};
+use rayon::iter::{IndexedParallelIterator, IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
 
 use crate::estimate::ensemble::{Batch, Parallel};
 
@@ -43,7 +40,7 @@ impl Workers {
         self.pool.current_num_threads()
     }
 
-    /// Runs `job` so that what it does in parallel uses this pool.
+    /// Runs `job` in this pool: from there, handing parts to the other threads is cheap.
     pub fn install<T: Send>(&self, job: impl FnOnce() -> T + Send) -> T {
         self.pool.install(job)
     }
@@ -59,12 +56,24 @@ impl Workers {
     }
 }
 
+/// In equal parts, one per thread: batches cost alike, and a window is too short to share it out piece by piece.
+fn split(batches: &mut [Batch], parts: usize, job: &(dyn Fn(&mut Batch) + Sync)) {
+    if parts < 2 || batches.len() < 2 {
+        batches.iter_mut().for_each(job);
+        return;
+    }
+    let (first, rest) = batches.split_at_mut(batches.len() / parts);
+    rayon::join(|| split(rest, parts - 1, job), || first.iter_mut().for_each(job));
+}
+
 impl Parallel for Workers {
     fn for_each(&self, batches: &mut [Batch], job: &(dyn Fn(&mut Batch) + Sync)) {
-        if self.threads() == 1 {
-            batches.iter_mut().for_each(job);
+        let threads = self.threads();
+        if threads == 1 || self.pool.current_thread_index().is_some() {
+            split(batches, threads, job);
         } else {
-            self.pool.install(|| batches.par_iter_mut().for_each(job));
+            // From outside, the hand-over costs as much as a short window.
+            self.pool.install(|| split(batches, threads, job));
         }
     }
 

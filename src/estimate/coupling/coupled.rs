@@ -4,7 +4,7 @@
 //! coordinates) as covariance. With perturbed observations this is randomised maximum likelihood; for a linear model
 //! it is the stochastic ensemble Kalman filter, and tends to the exact Kalman filter as members are added.
 
-use crate::estimate::statistics::centred;
+use crate::estimate::statistics::{centred, dot};
 use crate::xtfc::lu::substitute;
 
 /// Pivots below this share of the variance they came from are rounding: the direction has no spread left.
@@ -14,17 +14,23 @@ const SINGULAR: f64 = 1e-12;
 ///
 /// `root` is `[n x n]`, row-major, lower triangular. A singular covariance (fewer members than unknowns, something
 /// known exactly) leaves zero columns: directions without spread do not move.
+#[allow(clippy::cast_precision_loss)]
 pub fn covariance_root(rows: &[f64], members: usize, root: &mut Vec<f64>) {
-    *root = covariance(rows, rows, members);
     let n = rows.len() / members;
+    let centred: Vec<Vec<f64>> = rows.chunks_exact(members).map(centred).collect();
+    root.clear();
+    root.resize(n * n, 0.0);
+    for (i, a) in centred.iter().enumerate() {
+        for (j, b) in centred[..=i].iter().enumerate() {
+            root[i * n + j] = dot(a, b) / (members as f64 - 1.0);
+        }
+    }
     semidefinite_cholesky(root, n);
-    (0..n).for_each(|i| root[i * n + i + 1..(i + 1) * n].fill(0.0));
 }
 
 /// `root root^T`, `[n x n]`.
 #[must_use]
 pub fn square(root: &[f64], n: usize) -> Vec<f64> {
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
     root.chunks_exact(n).flat_map(|a| root.chunks_exact(n).map(|b| dot(a, b)).collect::<Vec<_>>()).collect()
 }
 
@@ -52,8 +58,11 @@ pub(crate) fn covariance(a: &[f64], b: &[f64], members: usize) -> Vec<f64> {
     let (a, b): (Vec<_>, Vec<_>) =
         (a.chunks_exact(members).map(centred).collect(), b.chunks_exact(members).map(centred).collect());
     let degrees = members as f64 - 1.0;
-    let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>() / degrees;
-    a.iter().flat_map(|a| b.iter().map(|b| product(a, b)).collect::<Vec<_>>()).collect()
+    let mut out = Vec::with_capacity(a.len() * b.len());
+    for a in &a {
+        out.extend(b.iter().map(|b| dot(a, b) / degrees));
+    }
+    out
 }
 
 /// The covariance of samples from that of what is expected of them `[m x m]`, and the noise of each.

@@ -7,6 +7,9 @@ use crate::estimate::time::{EventTime, ns_from_s};
 use crate::estimate::timing::TimingSource;
 use crate::model::Model;
 
+/// Pressures are looked at this often \[ns\], or at the end of every window where that is less often.
+const LOOK_NS: i64 = 4_000_000;
+
 /// What is known of the beat under way.
 #[derive(Debug, Clone)]
 pub(super) struct Beats {
@@ -58,7 +61,12 @@ impl<M: Model> Ensemble<M> {
     /// Takes in the window that was just solved.
     pub(super) fn follow(&mut self) {
         let Some(mut beats) = self.beats.take() else { return };
-        beats.end = beats.end.plus_ns(self.settings.window.length_ns);
+        let before = beats.end;
+        beats.end = before.plus_ns(self.settings.window.length_ns);
+        if before.0.div_euclid(LOOK_NS) == beats.end.0.div_euclid(LOOK_NS) && self.listening {
+            self.beats = Some(beats);
+            return;
+        }
         match self.cycles().zip(self.rate_hz()) {
             // Before the beat is found, clocks say nothing.
             Some(clock) if self.listening => {

@@ -71,7 +71,8 @@ impl<M: Model> Ensemble<M> {
         let covariance = coupled::square(&root, rows.len() / m);
         let precision = coupled::precision(&coupled::covariance(&expected, &expected, m), &judged.sd);
         let prior = SharedPrior { root: &root, covariance: &covariance, precision: &precision };
-        let report = self.learn(observations, (&judged.sd, &noise), Some(prior), parallel);
+        let before: Vec<_> = rows.chunks_exact(m).skip(self.model.n_states()).map(mean_and_sd).collect();
+        let report = self.learn(observations, (&judged.sd, &noise), (Some(prior), &before), parallel);
         self.root = root;
         // Clocks stand at the end of the window by now.
         let clock = self.model.cycle().zip(self.cycles());
@@ -96,7 +97,8 @@ impl<M: Model> Ensemble<M> {
         let judged = self.judge(observations, &expected);
         let sd: Vec<f64> = observations.iter().map(|o| self.settings.channels[o.channel].noise_sd_mmhg).collect();
         let noise = exact_normals(observations.len(), self.len(), &[], &mut self.rng, self.settings.instructions);
-        let report = self.learn(observations, (&sd, &noise), None, parallel);
+        let before = self.coordinates();
+        let report = self.learn(observations, (&sd, &noise), (None, &before), parallel);
         WindowReport { innovations: judged.innovations, expected: judged.expected, ..report }
     }
 

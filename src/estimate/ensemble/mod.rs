@@ -422,15 +422,14 @@ impl<M: Model> Ensemble<M> {
         self.account()
     }
 
-    /// Learns from the samples, after a look forward.
+    /// Learns from the samples, after a look forward; `before` are the coordinates of what is estimated.
     fn learn(
         &mut self,
         observations: &[Observation],
         (sd, noise): (&[f64], &[f64]),
-        shared: Option<SharedPrior<'_>>,
+        (shared, before): (Option<SharedPrior<'_>>, &[(f64, f64)]),
         parallel: &dyn Parallel,
     ) -> WindowReport {
-        let before = self.coordinates();
         let (h, estimated) = (self.clock_step_s(), self.estimated.clone());
         let lesson = Lesson { observations, sd, noise, members: self.len(), shared };
         self.each(parallel, |tools, batch| {
@@ -438,7 +437,7 @@ impl<M: Model> Ensemble<M> {
             batch.move_on(tools, &estimated, h);
         });
         let mut report = self.account();
-        report.informed = self.compare(&before);
+        report.informed = self.compare(before);
         report
     }
 
