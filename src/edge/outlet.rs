@@ -168,7 +168,7 @@ impl Outlet {
         let key = self.key(&bed.name, "estimate/beat");
         let message = BeatEstimate {
             header: self.header(&key, beat.start),
-            members: count(bed.estimator().settings().members),
+            members: count(bed.estimator().members()),
             end_ns: beat.end.0,
             names: self.model.clinical().iter().map(|q| q.name.to_owned()).collect(),
             units: self.model.clinical().iter().map(|q| q.unit.to_owned()).collect(),

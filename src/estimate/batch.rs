@@ -364,6 +364,14 @@ impl Batch {
         advance(tools, h, &mut self.theta);
     }
 
+    /// As if the last window had been spent where the members are now.
+    pub(super) fn stand_still(&mut self) {
+        self.window.start.clone_from(&self.x);
+        self.window.end.clone_from(&self.x);
+        self.window.theta.clone_from(&self.theta);
+        self.window.beta.fill(Lanes::default());
+    }
+
     /// Lanes beyond the last member are like the first.
     pub(super) fn fill_up(&mut self) {
         if self.count == WIDTH {

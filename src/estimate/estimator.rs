@@ -78,6 +78,8 @@ pub struct Estimator<M: Model> {
     /// When each estimated parameter last began to move, or the start.
     calm_since: Vec<EventTime>,
     want_members: bool,
+    /// Members to go on with.
+    members: usize,
     scratch: Snapshot,
 }
 
@@ -94,6 +96,7 @@ impl<M: Model> Estimator<M> {
             0.0,
             &Serial,
         )?;
+        let members = settings.members;
         Ok(Self {
             cutter: WindowCutter::new(settings.window, &settings.channels),
             tallies: settings.channels.iter().map(|_| ChannelTally::new()).collect(),
@@ -110,6 +113,7 @@ impl<M: Model> Estimator<M> {
             informed: Vec::new(),
             calm_since: Vec::new(),
             want_members: false,
+            members,
             scratch: Snapshot::default(),
         })
     }
@@ -181,6 +185,10 @@ impl<M: Model> Estimator<M> {
             Input::Tick => {}
             Input::End => self.cutter.end(),
             Input::WantMembers(want) => self.want_members = want,
+            Input::Members(members) => {
+                self.members = members.min(self.settings.members);
+                self.resize(out);
+            }
             Input::Beats(onsets) => {
                 self.told.extend(onsets);
                 self.told.sort_unstable();
@@ -202,6 +210,26 @@ impl<M: Model> Estimator<M> {
         if ended {
             self.put_out_the_rest(out);
         }
+    }
+
+    /// Goes on with as many members as the machine can keep up with.
+    fn resize(&mut self, out: &mut Vec<Output>) {
+        let wanted = self.members;
+        if self.ensemble.as_ref().is_none_or(|ensemble| !ensemble.would_resize(wanted)) {
+            return;
+        }
+        self.put_out_the_rest(out);
+        let time = self.time();
+        let Some(ensemble) = &mut self.ensemble else { return };
+        ensemble.set_members(wanted);
+        let now = ensemble.len();
+        let kind = if now < self.settings.members { NoticeKind::Overload(now) } else { NoticeKind::OverloadOver };
+        out.push(notice(time, kind, None));
+    }
+
+    /// Members that take part.
+    pub fn members(&self) -> usize {
+        self.ensemble.as_ref().map_or(self.members, Ensemble::len)
     }
 
     /// What was kept back because more might become known of it.
@@ -283,6 +311,7 @@ impl<M: Model> Estimator<M> {
             });
             self.ensemble = Some(ensemble);
             out.push(notice(window.start, NoticeKind::Start, None));
+            self.resize(out);
         }
         out.extend(window.gone_silent.iter().map(|&c| notice(window.end, NoticeKind::Gap, Some(c))));
         let observations = self.screen(window, out);

@@ -25,6 +25,8 @@ pub enum Input {
     Beats(Vec<EventTime>),
     /// Whether the whole ensemble is to be put out with every estimate.
     WantMembers(bool),
+    /// How many members to go on with, because the machine cannot keep up with more, or can again.
+    Members(usize),
 }
 
 /// What an estimator says.
@@ -102,6 +104,10 @@ pub enum NoticeKind {
     MembersReplaced(usize),
     /// No member of a window could be solved; the ensemble stays where it was.
     WindowFailed,
+    /// The machine cannot keep up: the ensemble goes on with this many of its members.
+    Overload(usize),
+    /// All members take part again.
+    OverloadOver,
     /// A sensor is disturbed and set aside.
     Artefact(Artefact),
     /// A sensor is taken back.
@@ -132,6 +138,8 @@ impl NoticeKind {
             Self::Restart => "restart",
             Self::MembersReplaced(_) => "members_lost",
             Self::WindowFailed => "window_failed",
+            Self::Overload(_) => "overload",
+            Self::OverloadOver => "overload_over",
             Self::Artefact(_) => "artefact",
             Self::ArtefactOver => "artefact_over",
             Self::Misfit => "model_misfit",
@@ -155,6 +163,8 @@ impl NoticeKind {
             Self::Restart => "started anew: silence too long to bridge, or the sender's clock jumped".to_owned(),
             Self::MembersReplaced(n) => format!("{n} members lost their numbers and were replaced by others"),
             Self::WindowFailed => "no member could be solved".to_owned(),
+            Self::Overload(n) => format!("the machine cannot keep up; the ensemble goes on with {n} members"),
+            Self::OverloadOver => "all members take part again".to_owned(),
             Self::Artefact(artefact) => format!("set aside ({}): {}", artefact.name(), artefact.text()),
             Self::ArtefactOver => "undisturbed again and taken back".to_owned(),
             Self::Misfit => "the model no longer says what this sensor reads, beat after beat; bands widen".to_owned(),

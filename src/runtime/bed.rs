@@ -39,6 +39,8 @@ pub enum Task {
     Refused(&'static str),
     /// Time has passed.
     Tick,
+    /// Go on with this share of the members.
+    Share(f64),
     /// Say how it goes.
     Report {
         /// Whether somebody wants the whole ensemble.
@@ -161,6 +163,11 @@ impl Bed {
             Task::Refused(cause) => self.refuse(cause, arrived, out),
             Task::Beats(onsets) => self.drive(Input::Beats(onsets), arrived, parallel, out),
             Task::Tick => self.drive(Input::Tick, arrived, parallel, out),
+            Task::Share(share) => {
+                #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+                let members = (self.estimator.settings().members as f64 * share).ceil() as usize;
+                self.drive(Input::Members(members), arrived, parallel, out);
+            }
             Task::Report { want_members, queue_depth, queue_full, inlet_full } => {
                 self.drive(Input::WantMembers(want_members), arrived, parallel, out);
                 return Some(self.health(queue_depth, &[("queue_full", queue_full), ("inlet_full", inlet_full)]));

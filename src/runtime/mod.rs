@@ -7,5 +7,6 @@
 
 pub mod bed;
 pub mod clock;
+pub mod governor;
 pub mod service;
 pub mod workers;

@@ -10,6 +10,7 @@ use tokio::sync::mpsc;
 
 use super::bed::{Bed, Health, Task};
 use super::clock::Clock;
+use super::governor::{self, Governor};
 use super::workers::Workers;
 use crate::estimate::estimator::{Estimator, Output};
 use crate::estimate::settings::{EstimatorSettings, SettingsError};
@@ -98,6 +99,8 @@ struct Slot {
     queue_full: u64,
     /// When it last had something to do.
     touched: ArrivalTime,
+    /// Share of the members that it was told to go on with.
+    share: f64,
 }
 
 /// The service.
@@ -112,6 +115,12 @@ pub struct Service {
     returns: mpsc::UnboundedSender<Event>,
     returned: mpsc::UnboundedReceiver<Event>,
     beds: BTreeMap<String, Slot>,
+    /// Beds that workers have.
+    away: usize,
+    governor: Governor,
+    /// Time that workers have spent, and when that was looked at last.
+    busy_ns: Arc<AtomicU64>,
+    looked: (ArrivalTime, u64),
     too_many_beds: u64,
     /// Events that did not fit into the queue, counted by the inlet.
     dropped: Arc<AtomicU64>,
@@ -146,6 +155,10 @@ impl Service {
             returns,
             returned,
             beds: BTreeMap::new(),
+            away: 0,
+            governor: Governor::default(),
+            busy_ns: Arc::default(),
+            looked: (clock.now(), 0),
             too_many_beds: 0,
             dropped: Arc::clone(&inlet.dropped),
         };
@@ -158,11 +171,17 @@ impl Service {
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
         let mut report = tokio::time::interval(self.limits.report_every);
         report.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+        let mut look = tokio::time::interval(governor::PERIOD);
+        look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
         let mut stopping = false;
         while !(stopping && self.is_idle()) {
             tokio::select! {
                 biased;
                 Some(event) = self.returned.recv() => self.take_back(event),
+                // Before what comes in, which may never end.
+                _ = look.tick() => self.look(),
+                _ = tick.tick(), if !stopping => self.tick(),
+                _ = report.tick(), if !stopping => self.report(),
                 Some(event) = self.events.recv(), if !stopping => match event {
                     Event::Task { bed, task } => self.enqueue(&bed, task),
                     Event::Stop => {
@@ -171,8 +190,6 @@ impl Service {
                     }
                     event @ (Event::Done(_) | Event::Lost(_)) => self.take_back(event),
                 },
-                _ = tick.tick(), if !stopping => self.tick(),
-                _ = report.tick(), if !stopping => self.report(),
                 else => break,
             }
         }
@@ -189,7 +206,8 @@ impl Service {
                 if let Some(slot) = self.beds.get_mut(&name) {
                     slot.bed = Some(bed);
                 }
-                self.dispatch(&name);
+                self.away -= 1;
+                self.dispatch();
             }
             Event::Lost(name) => {
                 self.sink.lost(&name);
@@ -197,7 +215,10 @@ impl Service {
                 if let (Some(slot), Some(bed)) = (self.beds.get_mut(&name), bed) {
                     slot.bed = Some(bed);
                     slot.waiting.clear();
+                    slot.share = 1.0;
                 }
+                self.away -= 1;
+                self.dispatch();
             }
             Event::Task { .. } | Event::Stop => {}
         }
@@ -225,7 +246,7 @@ impl Service {
             }
             let Some(bed) = self.new_bed(name) else { return };
             tracing::info!(bed = name, "new bed");
-            let slot = Slot { bed: Some(bed), waiting: VecDeque::new(), queue_full: 0, touched: now };
+            let slot = Slot { bed: Some(bed), waiting: VecDeque::new(), queue_full: 0, touched: now, share: 1.0 };
             self.beds.insert(name.to_owned(), slot);
         }
         let limit = self.limits.queue_tasks;
@@ -237,30 +258,61 @@ impl Service {
                 slot.touched = now;
             }
         }
-        self.dispatch(name);
+        self.dispatch();
     }
 
-    /// Hands a bed that is here and has something to do to a worker.
-    fn dispatch(&mut self, name: &str) {
-        let Some(slot) = self.beds.get_mut(name) else { return };
-        if slot.waiting.is_empty() {
-            return;
-        }
-        let Some(mut bed) = slot.bed.take() else { return };
-        let tasks: Vec<_> = slot.waiting.drain(..slot.waiting.len().min(TURN)).collect();
-        let (workers, sink, returns) = (Arc::clone(&self.workers), Arc::clone(&self.sink), self.returns.clone());
-        let name = name.to_owned();
-        self.workers.spawn(move || {
-            let work = AssertUnwindSafe(|| {
-                work_through(&mut bed, tasks, &workers, sink.as_ref());
-                bed
+    /// Hands beds to the workers, those first whose samples have waited longest: all windows have the same time to be
+    /// solved in, so that the earliest deadline is that of the earliest arrival. One more than there are workers, so that
+    /// none waits for this loop.
+    fn dispatch(&mut self) {
+        while self.away <= self.workers.threads() {
+            let ready = self.beds.iter_mut().filter(|(_, slot)| slot.bed.is_some());
+            let first = ready.filter_map(|(name, slot)| Some((slot.waiting.front()?.1, name, slot)));
+            let Some((_, name, slot)) = first.min_by_key(|(arrived, name, _)| (*arrived, *name)) else { return };
+            let Some(mut bed) = slot.bed.take() else { return };
+            let mut tasks: Vec<_> = slot.waiting.drain(..slot.waiting.len().min(TURN)).collect();
+            let share = self.governor.share();
+            if share.to_bits() != slot.share.to_bits() {
+                slot.share = share;
+                tasks.insert(0, (Task::Share(share), tasks[0].1));
+            }
+            let (workers, sink, returns) = (Arc::clone(&self.workers), Arc::clone(&self.sink), self.returns.clone());
+            let (name, clock, busy_ns) = (name.clone(), self.clock, Arc::clone(&self.busy_ns));
+            self.away += 1;
+            self.workers.spawn(move || {
+                let started = clock.now();
+                let work = AssertUnwindSafe(|| {
+                    work_through(&mut bed, tasks, &workers, sink.as_ref());
+                    bed
+                });
+                // A defect in one bed must not take the others with it.
+                let event = catch_unwind(work).map_or_else(|_| Event::Lost(name), Event::Done);
+                let spent = u64::try_from(clock.now().ns_since(started)).unwrap_or(0);
+                busy_ns.fetch_add(spent, Ordering::Relaxed);
+                // Let go before the bed is back: when the service has stopped, nobody is left who still publishes.
+                drop((workers, sink));
+                let _ = returns.send(event);
             });
-            // A defect in one bed must not take the others with it.
-            let event = catch_unwind(work).map_or_else(|_| Event::Lost(name), Event::Done);
-            // Let go before the bed is back: when the service has stopped, nobody is left who still publishes.
-            drop((workers, sink));
-            let _ = returns.send(event);
-        });
+        }
+    }
+
+    /// Sees whether the machine keeps up.
+    #[allow(clippy::cast_precision_loss)]
+    fn look(&mut self) {
+        let (now, busy_ns) = (self.clock.now(), self.busy_ns.load(Ordering::Relaxed));
+        let (before, busy_before) = std::mem::replace(&mut self.looked, (now, busy_ns));
+        let available = now.ns_since(before) as f64 * self.workers.threads() as f64;
+        let waits = self.beds.values().filter_map(|slot| Some(now.ns_since(slot.waiting.front()?.1)));
+        let longest = Duration::from_nanos(u64::try_from(waits.max().unwrap_or(0)).unwrap_or(0));
+        let busy = if available > 0.0 { (busy_ns - busy_before) as f64 / available } else { 0.0 };
+        if let Some(share) = self.governor.look(longest, busy) {
+            let (beds, waited_ms) = (self.beds.len(), longest.as_millis());
+            if share < 1.0 {
+                tracing::warn!(beds, share, busy, "overload: samples have waited {waited_ms} ms");
+            } else {
+                tracing::info!(beds, busy, "overload is over: all members take part again");
+            }
+        }
     }
 
     fn tick(&mut self) {

@@ -10,6 +10,7 @@ mod kalman;
 mod lanes;
 mod live;
 mod model;
+mod overload;
 mod reproduce;
 mod service;
 mod stream;

@@ -25,6 +25,11 @@ pub(super) struct Beats {
 }
 
 impl Beats {
+    /// Forgets the beat under way.
+    pub(super) fn begin_again(&mut self) {
+        self.follower = BeatFollower::default();
+    }
+
     /// Forgets what ended after `time`, which is looked at again.
     pub(super) fn take_back(&mut self, time: EventTime) {
         self.over.retain(|beat| beat.end <= time);

@@ -5,6 +5,7 @@ mod clock;
 mod look;
 mod review;
 mod setup;
+mod size;
 mod summary;
 
 use rand::SeedableRng;
@@ -107,6 +108,8 @@ pub struct Ensemble<M: Model> {
     varying: Vec<usize>,
     unknowns: Unknowns,
     pub(super) batches: Vec<Batch>,
+    /// Batches that take no part for the time being, in their order.
+    resting: Vec<Batch>,
     /// Equations for eight members at once; None where members are solved one by one.
     lanes: Option<M::Lanes>,
     pub(super) rng: ChaCha8Rng,
@@ -198,6 +201,7 @@ impl<M: Model> Ensemble<M> {
             paces: estimated.iter().zip(&centre).map(pace).collect(),
             fits: settings.channels.iter().map(|c| channel_fit(&settings, c)).collect(),
             batches,
+            resting: Vec::new(),
             lanes: model.lanes().filter(|_| settings.coupling.is_xtfc()),
             model,
             settings,
@@ -242,9 +246,9 @@ impl<M: Model> Ensemble<M> {
         &self.estimated
     }
 
-    /// Number of members.
+    /// Number of members that take part.
     pub fn len(&self) -> usize {
-        self.settings.members
+        self.batches.last().map_or(0, |batch| batch.first() + batch.len())
     }
 
     /// Never true of a constructed ensemble.

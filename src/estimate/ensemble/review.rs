@@ -54,6 +54,12 @@ impl Memory {
         self.checkpoints.is_empty() || self.since.len() as f64 * h >= CHECKPOINT_S - 1e-9
     }
 
+    /// Nothing is remembered.
+    pub(super) fn forget(&mut self) {
+        self.checkpoints.clear();
+        self.since.clear();
+    }
+
     fn keep(&mut self, checkpoint: Checkpoint) {
         self.checkpoints.push_back((checkpoint, std::mem::take(&mut self.since)));
         if self.checkpoints.len() > CHECKPOINTS {

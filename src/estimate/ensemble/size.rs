@@ -1,0 +1,148 @@
+//! Fewer members for a while, and all of them again.
+//!
+//! A subset of a hundred members has another mean and covariance than all of them: those that stay are moved so that
+//! they have both (where they are draws from one posterior), and those that come back are drawn from what the others
+//! make of it by then.
+
+use super::Ensemble;
+use crate::estimate::coupling::coupled::covariance_root;
+use crate::estimate::random::exact_normals;
+use crate::estimate::settings::CouplingKind;
+use crate::estimate::smoother::Smoother;
+use crate::estimate::statistics::{centred, mean_and_sd};
+use crate::model::Model;
+use crate::model::lanes::{Lanes, WIDTH};
+
+impl<M: Model> Ensemble<M> {
+    /// Goes on with about this many members, whole batches of them, two at least; all if it is asked for more than there
+    /// are. What was remembered of the last moments is forgotten, and with it the beat under way. True if their number
+    /// changed.
+    pub fn set_members(&mut self, members: usize) -> bool {
+        let batches = self.batches_for(members);
+        if batches == self.batches.len() {
+            return false;
+        }
+        if batches < self.batches.len() {
+            self.rest(batches);
+        } else {
+            self.wake(batches);
+        }
+        self.memory.forget();
+        self.smoother = Smoother::default();
+        if let Some(beats) = &mut self.beats {
+            beats.begin_again();
+        }
+        true
+    }
+
+    /// Whether [`Ensemble::set_members`] would change their number.
+    pub fn would_resize(&self, members: usize) -> bool {
+        self.batches_for(members) != self.batches.len()
+    }
+
+    fn batches_for(&self, members: usize) -> usize {
+        // The cloud of this filter is a picture of its moments: fewer points would save nothing.
+        if self.settings.coupling == CouplingKind::Ukf {
+            return self.batches.len();
+        }
+        let all = self.batches.len() + self.resting.len();
+        members.div_ceil(WIDTH).clamp(LEAST_BATCHES.min(all), all)
+    }
+
+    fn rest(&mut self, batches: usize) {
+        let moments = Moments::of(&self.rows(), self.len());
+        // The last rest first, so that they come back in their order.
+        let mut resting = self.batches.split_off(batches);
+        resting.append(&mut self.resting);
+        self.resting = resting;
+        if self.settings.coupling.is_bayesian() {
+            let (rows, m) = (self.rows(), self.len());
+            let own = Moments::of(&rows, m);
+            let centred: Vec<f64> = rows.chunks_exact(m).flat_map(centred).collect();
+            self.place_all(&moments.spread(&own.whitened(centred, m), m), 0);
+        }
+    }
+
+    fn wake(&mut self, batches: usize) {
+        let moments = Moments::of(&self.rows(), self.len());
+        let common = self.theta_of(0);
+        let first = self.batches.len();
+        let back: Vec<_> = self.resting.drain(..batches - first).collect();
+        for mut batch in back {
+            // What is the same in all members may have changed while they rested.
+            batch.theta.iter_mut().zip(&common).for_each(|(theta, value)| *theta = Lanes::splat(*value));
+            self.batches.push(batch);
+        }
+        let m: usize = self.batches[first..].iter().map(super::Batch::len).sum();
+        let draws = exact_normals(moments.mean.len(), m, &[], &mut self.rng, self.settings.instructions);
+        self.place_all(&moments.spread(&draws, m), first);
+    }
+
+    /// Sets states and parameter coordinates of the batches from `first` on, `[n_u x their members]`, between two windows.
+    fn place_all(&mut self, rows: &[f64], first: usize) {
+        let Self { batches, estimated, transforms, settings, model, .. } = self;
+        let (n, batches) = (model.n_states(), &mut batches[first..]);
+        let offset = batches.first().map_or(0, super::Batch::first);
+        let m: usize = batches.iter().map(super::Batch::len).sum();
+        for batch in batches {
+            let (at, count) = (batch.first() - offset, batch.len());
+            let row = |k: usize| &rows[k * m + at..][..count];
+            for s in 0..n {
+                batch.x[s].0[..count].copy_from_slice(row(s));
+            }
+            for (k, &p) in estimated.iter().enumerate() {
+                for (value, u) in batch.theta[p].0.iter_mut().zip(row(n + k)) {
+                    *value = settings.beliefs[p].value(transforms[k], *u);
+                }
+            }
+            batch.fill_up();
+            batch.stand_still();
+        }
+    }
+}
+
+/// Batches that stay in any case: an ensemble of fewer says nothing about its spread.
+const LEAST_BATCHES: usize = 2;
+
+/// Mean and root of the covariance.
+struct Moments {
+    mean: Vec<f64>,
+    /// `[n x n]`, lower triangular.
+    root: Vec<f64>,
+}
+
+impl Moments {
+    fn of(rows: &[f64], members: usize) -> Self {
+        let mut root = Vec::new();
+        covariance_root(rows, members, &mut root);
+        Self { mean: rows.chunks_exact(members).map(|row| mean_and_sd(row).0).collect(), root }
+    }
+
+    /// `root^-1` times centred rows `[n x members]`; zero in directions without spread.
+    fn whitened(&self, mut rows: Vec<f64>, members: usize) -> Vec<f64> {
+        let n = self.mean.len();
+        for i in 0..n {
+            let (known, rest) = rows.split_at_mut(i * members);
+            let row = &mut rest[..members];
+            for (other, factor) in known.chunks_exact(members).zip(&self.root[i * n..]) {
+                row.iter_mut().zip(other).for_each(|(value, z)| *value -= factor * z);
+            }
+            let pivot = self.root[i * n + i];
+            row.iter_mut().for_each(|value| *value = if pivot > 0.0 { *value / pivot } else { 0.0 });
+        }
+        rows
+    }
+
+    /// `mean + root z`, `[n x members]`.
+    fn spread(&self, z: &[f64], members: usize) -> Vec<f64> {
+        let n = self.mean.len();
+        let mut out = Vec::with_capacity(z.len());
+        for (mean, root) in self.mean.iter().zip(self.root.chunks_exact(n)) {
+            for i in 0..members {
+                let terms = root.iter().enumerate().map(|(k, factor)| factor * z[k * members + i]);
+                out.push(mean + terms.sum::<f64>());
+            }
+        }
+        out
+    }
+}
