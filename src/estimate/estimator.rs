@@ -3,6 +3,7 @@
 //! The service, the file command, the tests and the simulator of bad networks drive this same state machine.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use super::adapt::fit::ChannelFit;
 use super::ensemble::{Ensemble, Observation, Parallel, Serial, Snapshot, WindowReport, with_companions};
@@ -62,6 +63,8 @@ pub struct Estimator<M: Model> {
     settings: EstimatorSettings,
     cutter: WindowCutter,
     estimated: Vec<usize>,
+    /// The members as they start, and those of a filter beside them.
+    drawn: (Arc<Ensemble<M>>, Option<Arc<Ensemble<M>>>),
     /// None until the first window.
     ensemble: Option<Ensemble<M>>,
     /// A filter beside it.
@@ -84,23 +87,22 @@ pub struct Estimator<M: Model> {
 }
 
 impl<M: Model> Estimator<M> {
-    /// An estimator that waits for its first sample.
+    /// An estimator that waits for its first sample. Its clones are further beds, and share what was drawn for it.
     ///
     /// # Errors
     /// When the settings do not fit the model.
     pub fn new(model: M, settings: EstimatorSettings) -> Result<Self, SettingsError> {
-        // Drawn once here, so that unusable settings are refused before anything starts.
-        Ensemble::new(
-            model.clone(),
-            EstimatorSettings { members: 2.min(settings.members), ..settings.clone() },
-            0.0,
-            &Serial,
-        )?;
+        let drawn = Arc::new(Ensemble::new(model.clone(), settings.clone(), &Serial)?);
+        let second = settings.live.second_opinion.map(|coupling| {
+            let settings = EstimatorSettings { coupling, ..settings.clone() };
+            Ensemble::new(model.clone(), settings, &Serial).map(Arc::new)
+        });
         let members = settings.members;
         Ok(Self {
             cutter: WindowCutter::new(settings.window, &settings.channels),
             tallies: settings.channels.iter().map(|_| ChannelTally::new()).collect(),
             tracker: tracker(&settings),
+            drawn: (drawn, second.transpose()?),
             second: None,
             told: Vec::new(),
             estimated: with_companions(&model, &settings.estimate),
@@ -296,19 +298,12 @@ impl<M: Model> Estimator<M> {
     fn solve(&mut self, window: &ClosedWindow, parallel: &dyn Parallel, out: &mut Vec<Output>) {
         let first = self.ensemble.is_none();
         if first {
-            let drawn = Ensemble::new(self.model.clone(), self.settings.clone(), window.start.as_s(), parallel);
-            // Checked when the estimator was made; a failure here leaves the bed without estimates, visibly.
-            let Ok(mut ensemble) = drawn else {
-                out.push(notice(window.start, NoticeKind::WindowFailed, None));
-                return;
-            };
+            let start_s = window.start.as_s();
+            let mut ensemble = self.drawn.0.starting_at(start_s);
             ensemble.follow_beats(window.start);
             self.informed = vec![window.start; ensemble.estimated().len()];
             self.calm_since.clone_from(&self.informed);
-            self.second = self.settings.live.second_opinion.and_then(|coupling| {
-                let settings = EstimatorSettings { coupling, ..self.settings.clone() };
-                Ensemble::new(self.model.clone(), settings, window.start.as_s(), parallel).ok()
-            });
+            self.second = self.drawn.1.as_ref().map(|second| second.starting_at(start_s));
             self.ensemble = Some(ensemble);
             out.push(notice(window.start, NoticeKind::Start, None));
             self.resize(out);

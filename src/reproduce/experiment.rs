@@ -63,7 +63,7 @@ impl<M: Model> Experiment<'_, M> {
     pub(super) fn run(self, parallel: &dyn Parallel) -> Result<Trace, SettingsError> {
         let h = s_from_ns(self.settings.window.length_ns);
         let windows = (self.until_s / h).round() as usize;
-        let mut ensemble = Ensemble::new(self.model, self.settings, 0.0, parallel)?;
+        let mut ensemble = Ensemble::new(self.model, self.settings, parallel)?;
         let estimated = ensemble.estimated().to_vec();
         let mut trace = Trace { averages: vec![vec![0.0; ensemble.len()]; estimated.len()], ..Trace::default() };
         let mut averaged = 0_usize;

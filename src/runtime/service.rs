@@ -12,6 +12,7 @@ use super::bed::{Bed, Health, Task};
 use super::clock::Clock;
 use super::governor::{self, Governor};
 use super::workers::Workers;
+use crate::estimate::ensemble::{Parallel, Serial};
 use crate::estimate::estimator::{Estimator, Output};
 use crate::estimate::settings::{EstimatorSettings, SettingsError};
 use crate::estimate::time::ArrivalTime;
@@ -105,8 +106,8 @@ struct Slot {
 
 /// The service.
 pub struct Service {
-    model: Circulation,
-    settings: EstimatorSettings,
+    /// Every bed begins as its clone.
+    estimator: Estimator<Circulation>,
     limits: Limits,
     workers: Arc<Workers>,
     sink: Arc<dyn Sink>,
@@ -139,14 +140,13 @@ impl Service {
         sink: Arc<dyn Sink>,
         clock: Clock,
     ) -> Result<(Self, Inlet), SettingsError> {
-        Estimator::new(model.clone(), settings.clone())?;
+        let estimator = Estimator::new(model, settings)?;
         let (sender, events) = mpsc::channel(limits.queue_tasks.saturating_mul(16).clamp(1024, 65_536));
         // Unbounded in type only: there is at most one return per bed.
         let (returns, returned) = mpsc::unbounded_channel();
         let inlet = Inlet { events: sender, dropped: Arc::default() };
         let service = Self {
-            model,
-            settings,
+            estimator,
             limits,
             workers,
             sink,
@@ -212,7 +212,7 @@ impl Service {
             Event::Lost(name) => {
                 self.sink.lost(&name);
                 let bed = self.new_bed(&name);
-                if let (Some(slot), Some(bed)) = (self.beds.get_mut(&name), bed) {
+                if let Some(slot) = self.beds.get_mut(&name) {
                     slot.bed = Some(bed);
                     slot.waiting.clear();
                     slot.share = 1.0;
@@ -224,9 +224,8 @@ impl Service {
         }
     }
 
-    fn new_bed(&self, name: &str) -> Option<Box<Bed>> {
-        let estimator = Estimator::new(self.model.clone(), self.settings.clone()).ok()?;
-        Some(Box::new(Bed::new(name.to_owned(), estimator, self.clock)))
+    fn new_bed(&self, name: &str) -> Box<Bed> {
+        Box::new(Bed::new(name.to_owned(), self.estimator.clone(), self.clock))
     }
 
     fn enqueue(&mut self, name: &str, task: Task) {
@@ -244,7 +243,7 @@ impl Service {
                 }
                 return;
             }
-            let Some(bed) = self.new_bed(name) else { return };
+            let bed = self.new_bed(name);
             tracing::info!(bed = name, "new bed");
             let slot = Slot { bed: Some(bed), waiting: VecDeque::new(), queue_full: 0, touched: now, share: 1.0 };
             self.beds.insert(name.to_owned(), slot);
@@ -278,11 +277,14 @@ impl Service {
             }
             let (workers, sink, returns) = (Arc::clone(&self.workers), Arc::clone(&self.sink), self.returns.clone());
             let (name, clock, busy_ns) = (name.clone(), self.clock, Arc::clone(&self.busy_ns));
+            // With a bed for every worker, sharing one out gains nothing.
+            let shared_out = self.beds.len() < self.workers.threads();
             self.away += 1;
             self.workers.spawn(move || {
                 let started = clock.now();
                 let work = AssertUnwindSafe(|| {
-                    work_through(&mut bed, tasks, &workers, sink.as_ref());
+                    let parallel: &dyn Parallel = if shared_out { workers.as_ref() } else { &Serial };
+                    work_through(&mut bed, tasks, parallel, sink.as_ref());
                     bed
                 });
                 // A defect in one bed must not take the others with it.
@@ -338,10 +340,10 @@ impl Service {
     }
 }
 
-fn work_through(bed: &mut Bed, tasks: Vec<(Task, ArrivalTime)>, workers: &Workers, sink: &dyn Sink) {
+fn work_through(bed: &mut Bed, tasks: Vec<(Task, ArrivalTime)>, parallel: &dyn Parallel, sink: &dyn Sink) {
     let mut outputs = Vec::new();
     for (task, arrived) in tasks {
-        let health = bed.handle(task, arrived, workers, &mut outputs);
+        let health = bed.handle(task, arrived, parallel, &mut outputs);
         if !outputs.is_empty() || health.is_some() {
             sink.put(bed, &outputs, health.as_ref());
             outputs.clear();

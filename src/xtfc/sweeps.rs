@@ -11,6 +11,9 @@ pub const MAX_SWEEPS: usize = 20;
 /// The same, where there are samples.
 pub const MAX_ROUNDS: usize = 14;
 
+/// Up to this many nodes there is code with less to clear away.
+const FEW: usize = 5;
+
 /// Most nodes of a batch.
 const MAX_NODES: usize = 8;
 
@@ -170,7 +173,11 @@ pub fn forecast<M: LaneModel>(
     solutions.beta.resize(nodes * solutions.start.len(), Lanes::default());
     solutions.end.resize(solutions.start.len(), Lanes::default());
     let limit = tolerance_mmhg / expressions.length_s;
-    instructions.run(Forecast { model, expressions, limit, solutions })
+    if nodes <= FEW {
+        instructions.run(Forecast::<M, FEW> { model, expressions, limit, solutions })
+    } else {
+        instructions.run(Forecast::<M, MAX_NODES> { model, expressions, limit, solutions })
+    }
 }
 
 /// A window with samples, from the solution without them (by [`forecast`]). None, with nothing done, where `model` does
@@ -188,45 +195,57 @@ pub fn fit<M: LaneModel>(
     if !freedom.unknowns.parameters.iter().all(|&p| model.knows(p)) {
         return None;
     }
-    instructions.run(Fit { model, expressions, samples, freedom, tolerance_mmhg, scratch, solutions })
+    if expressions.times_s.len() <= FEW {
+        instructions.run(Fit::<M, FEW> { model, expressions, samples, freedom, tolerance_mmhg, scratch, solutions })
+    } else {
+        instructions.run(Fit::<M, MAX_NODES> {
+            model,
+            expressions,
+            samples,
+            freedom,
+            tolerance_mmhg,
+            scratch,
+            solutions,
+        })
+    }
 }
 
 /// Something at every node. Lent, not owned, by what is made of it: these are too large to be moved about.
-type AtNodes<T> = [T; MAX_NODES];
+type AtNodes<T, const N: usize> = [T; N];
 
 /// The equations of a model at the nodes of a window.
-struct Equations<'a, M: LaneModel> {
+struct Equations<'a, M: LaneModel, const N: usize> {
     fixed: M::Fixed,
-    moments: &'a mut AtNodes<M::Moment>,
+    moments: &'a mut AtNodes<M::Moment, N>,
     expressions: &'a Expressions,
 }
 
 /// The path of the members: slopes and states at the nodes.
-struct Path<'a, M: LaneModel> {
+struct Path<'a, M: LaneModel, const N: usize> {
     start: M::State,
-    slopes: &'a mut AtNodes<M::State>,
+    slopes: &'a mut AtNodes<M::State, N>,
 }
 
 /// The derivatives where the equations were evaluated last, and relaxations that fit them well enough.
-struct Tangents<'a, M: LaneModel> {
-    tangents: &'a mut AtNodes<M::Tangent>,
-    relaxations: &'a mut AtNodes<M::Relaxation>,
+struct Tangents<'a, M: LaneModel, const N: usize> {
+    tangents: &'a mut AtNodes<M::Tangent, N>,
+    relaxations: &'a mut AtNodes<M::Relaxation, N>,
 }
 
 /// The dual path: `g = (I - df/dx phi)^-T b`, and `(df/dx)^T g`.
-struct Dual<'a, M: LaneModel> {
-    g: &'a mut AtNodes<M::State>,
-    pulled: &'a mut AtNodes<M::State>,
+struct Dual<'a, M: LaneModel, const N: usize> {
+    g: &'a mut AtNodes<M::State, N>,
+    pulled: &'a mut AtNodes<M::State, N>,
 }
 
 #[allow(clippy::inline_always)]
-impl<'a, M: LaneModel> Equations<'a, M> {
+impl<'a, M: LaneModel, const N: usize> Equations<'a, M, N> {
     #[inline(always)]
     fn new(
         model: &M,
         expressions: &'a Expressions,
         theta: &[Lanes],
-        moments: &'a mut AtNodes<M::Moment>,
+        moments: &'a mut AtNodes<M::Moment, N>,
     ) -> Option<Self> {
         let mut equations = Self { fixed: model.fixed(theta)?, moments, expressions };
         equations.set_moments();
@@ -235,7 +254,7 @@ impl<'a, M: LaneModel> Equations<'a, M> {
 
     #[inline(always)]
     fn nodes(&self) -> usize {
-        self.expressions.times_s.len().min(MAX_NODES)
+        self.expressions.times_s.len().min(N)
     }
 
     /// `phi` at a node, `[n_nodes]`.
@@ -253,7 +272,7 @@ impl<'a, M: LaneModel> Equations<'a, M> {
 
     /// Derivatives at the start of the window, for all nodes.
     #[inline(always)]
-    fn look_ahead(&self, tangent: M::Tangent, at: &mut Tangents<'_, M>) {
+    fn look_ahead(&self, tangent: M::Tangent, at: &mut Tangents<'_, M, N>) {
         for node in 0..self.nodes() {
             at.tangents[node] = tangent;
             at.relaxations[node] = M::relaxation(&self.fixed, &self.moments[node], &tangent, self.phi(node)[node]);
@@ -265,10 +284,10 @@ impl<'a, M: LaneModel> Equations<'a, M> {
     #[inline(always)]
     fn sweep(
         &self,
-        path: &mut Path<'_, M>,
-        at: &mut Tangents<'_, M>,
-        errors: Option<&AtNodes<M::State>>,
-        mut states: Option<&mut AtNodes<M::State>>,
+        path: &mut Path<'_, M, N>,
+        at: &mut Tangents<'_, M, N>,
+        errors: Option<&AtNodes<M::State, N>>,
+        mut states: Option<&mut AtNodes<M::State, N>>,
     ) -> Lanes {
         let mut largest = Lanes::splat(0.0);
         for node in 0..self.nodes() {
@@ -300,7 +319,7 @@ impl<'a, M: LaneModel> Equations<'a, M> {
 
     /// The same for the dual equations, which run backwards.
     #[inline(always)]
-    fn sweep_dual(&self, at: &Tangents<'_, M>, drive: &AtNodes<M::State>, dual: &mut Dual<'_, M>) -> Lanes {
+    fn sweep_dual(&self, at: &Tangents<'_, M, N>, drive: &AtNodes<M::State, N>, dual: &mut Dual<'_, M, N>) -> Lanes {
         let mut largest = Lanes::splat(0.0);
         for node in (0..self.nodes()).rev() {
             let mut residual = drive[node];
@@ -325,13 +344,13 @@ impl<'a, M: LaneModel> Equations<'a, M> {
 }
 
 #[allow(clippy::inline_always)]
-impl<'a, M: LaneModel> Path<'a, M> {
+impl<'a, M: LaneModel, const N: usize> Path<'a, M, N> {
     /// Slopes constant over the window; the derivative at its start.
     #[inline(always)]
     fn straight(
-        equations: &Equations<'_, M>,
+        equations: &Equations<'_, M, N>,
         start: &[Lanes],
-        slopes: &'a mut AtNodes<M::State>,
+        slopes: &'a mut AtNodes<M::State, N>,
     ) -> (Self, M::Tangent) {
         let start = state::<M>(start);
         let (slope, tangent) = M::linearise(&equations.fixed, &equations.moments[0], &start);
@@ -364,7 +383,7 @@ impl<'a, M: LaneModel> Path<'a, M> {
     }
 
     #[inline(always)]
-    fn write(&self, equations: &Equations<'_, M>, solutions: &mut Solutions) {
+    fn write(&self, equations: &Equations<'_, M, N>, solutions: &mut Solutions) {
         solutions.start.copy_from_slice(self.start.as_ref());
         solutions.end.copy_from_slice(self.at(&equations.expressions.end).as_ref());
         for (i, beta) in solutions.beta.chunks_exact_mut(equations.nodes()).enumerate() {
@@ -439,7 +458,7 @@ impl Left {
     }
 }
 
-struct Forecast<'a, M> {
+struct Forecast<'a, M, const N: usize> {
     model: &'a M,
     expressions: &'a Expressions,
     limit: f64,
@@ -447,18 +466,17 @@ struct Forecast<'a, M> {
 }
 
 #[allow(clippy::inline_always)]
-impl<M: LaneModel> pulp::NullaryFnOnce for Forecast<'_, M> {
+impl<M: LaneModel, const N: usize> pulp::NullaryFnOnce for Forecast<'_, M, N> {
     type Output = Option<Progress>;
 
     #[inline(always)]
     fn call(self) -> Self::Output {
         let Self { model, expressions, limit, solutions } = self;
-        let (mut moments, mut slopes) = ([M::Moment::default(); MAX_NODES], [M::State::default(); MAX_NODES]);
-        let equations = Equations::<M>::new(model, expressions, &solutions.theta, &mut moments)?;
+        let (mut moments, mut slopes) = ([M::Moment::default(); N], [M::State::default(); N]);
+        let equations = Equations::<M, N>::new(model, expressions, &solutions.theta, &mut moments)?;
         let (mut path, tangent) = Path::straight(&equations, &solutions.start, &mut slopes);
-        let (mut tangents, mut relaxations) =
-            ([M::Tangent::default(); MAX_NODES], [M::Relaxation::default(); MAX_NODES]);
-        let mut at = Tangents::<M> { tangents: &mut tangents, relaxations: &mut relaxations };
+        let (mut tangents, mut relaxations) = ([M::Tangent::default(); N], [M::Relaxation::default(); N]);
+        let mut at = Tangents::<M, N> { tangents: &mut tangents, relaxations: &mut relaxations };
         equations.look_ahead(tangent, &mut at);
         let (mut left, mut sweeps) = (Left::START, 0);
         while sweeps < MAX_SWEEPS {
@@ -476,7 +494,7 @@ impl<M: LaneModel> pulp::NullaryFnOnce for Forecast<'_, M> {
     }
 }
 
-struct Fit<'a, M> {
+struct Fit<'a, M, const N: usize> {
     model: &'a M,
     expressions: &'a Expressions,
     samples: &'a Samples<'a>,
@@ -487,35 +505,34 @@ struct Fit<'a, M> {
 }
 
 #[allow(clippy::inline_always)]
-impl<M: LaneModel> pulp::NullaryFnOnce for Fit<'_, M> {
+impl<M: LaneModel, const N: usize> pulp::NullaryFnOnce for Fit<'_, M, N> {
     type Output = Option<Progress>;
 
     #[inline(always)]
     fn call(self) -> Self::Output {
         let Self { model, expressions, samples, freedom, tolerance_mmhg, scratch, solutions } = self;
-        let (mut moments, mut slopes) = ([M::Moment::default(); MAX_NODES], [M::State::default(); MAX_NODES]);
-        let mut equations = Equations::<M>::new(model, expressions, &solutions.theta, &mut moments)?;
+        let (mut moments, mut slopes) = ([M::Moment::default(); N], [M::State::default(); N]);
+        let mut equations = Equations::<M, N>::new(model, expressions, &solutions.theta, &mut moments)?;
         let nodes = equations.nodes();
         let mean = state::<M>(&solutions.start);
-        let mut path = Path::<M> { start: mean, slopes: &mut slopes };
+        let mut path = Path::<M, N> { start: mean, slopes: &mut slopes };
         for (i, beta) in solutions.beta.chunks_exact(nodes).enumerate() {
             for (beta, slopes) in beta.iter().zip(path.slopes.iter_mut()) {
                 slopes.as_mut()[i] = *beta;
             }
         }
         // Derivatives where the members are; the residual is that of the forecast.
-        let (mut tangents, mut relaxations) =
-            ([M::Tangent::default(); MAX_NODES], [M::Relaxation::default(); MAX_NODES]);
-        let mut at = Tangents::<M> { tangents: &mut tangents, relaxations: &mut relaxations };
+        let (mut tangents, mut relaxations) = ([M::Tangent::default(); N], [M::Relaxation::default(); N]);
+        let mut at = Tangents::<M, N> { tangents: &mut tangents, relaxations: &mut relaxations };
         let (_, tangent) = M::linearise(&equations.fixed, &equations.moments[0], &path.start);
         equations.look_ahead(tangent, &mut at);
-        let mut states = [M::State::default(); MAX_NODES];
+        let mut states = [M::State::default(); N];
         equations.sweep(&mut path, &mut at, None, Some(&mut states));
 
         scratch.begin(samples, freedom, &path, &solutions.theta);
-        let (mut g, mut pulled) = ([M::State::default(); MAX_NODES], [M::State::default(); MAX_NODES]);
-        let mut dual = Dual::<M> { g: &mut g, pulled: &mut pulled };
-        let (mut drive, mut errors) = ([M::State::default(); MAX_NODES], [M::State::default(); MAX_NODES]);
+        let (mut g, mut pulled) = ([M::State::default(); N], [M::State::default(); N]);
+        let mut dual = Dual::<M, N> { g: &mut g, pulled: &mut pulled };
+        let (mut drive, mut errors) = ([M::State::default(); N], [M::State::default(); N]);
         if freedom.precision.is_none() {
             let (work, known) = ((&mut dual, &mut drive), (&at, &states));
             scratch.guess(model, &equations, samples, freedom, work, known, &solutions.theta);
@@ -586,11 +603,11 @@ impl<M: LaneModel> pulp::NullaryFnOnce for Fit<'_, M> {
 /// `B^T g`: what the dual path says of the state at the start and the parameters, `[n_u]`.
 #[allow(clippy::inline_always)]
 #[inline(always)]
-fn pull_back<M: LaneModel>(
+fn pull_back<M: LaneModel, const N: usize>(
     model: &M,
-    equations: &Equations<'_, M>,
+    equations: &Equations<'_, M, N>,
     freedom: &Freedom<'_>,
-    (dual, states): (&Dual<'_, M>, &AtNodes<M::State>),
+    (dual, states): (&Dual<'_, M, N>, &AtNodes<M::State, N>),
     theta: &[Lanes],
     out: &mut [Lanes],
 ) {
@@ -630,14 +647,14 @@ impl FitScratch {
     /// Works out the inverse covariance of the weighted samples, `S = 1 + H P H^T + G G^T / w^2`.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
-    fn guess<M: LaneModel>(
+    fn guess<M: LaneModel, const N: usize>(
         &mut self,
         model: &M,
-        equations: &Equations<'_, M>,
+        equations: &Equations<'_, M, N>,
         samples: &Samples<'_>,
         freedom: &Freedom<'_>,
-        (dual, drive): (&mut Dual<'_, M>, &mut AtNodes<M::State>),
-        (at, states): (&Tangents<'_, M>, &AtNodes<M::State>),
+        (dual, drive): (&mut Dual<'_, M, N>, &mut AtNodes<M::State, N>),
+        (at, states): (&Tangents<'_, M, N>, &AtNodes<M::State, N>),
         theta: &[Lanes],
     ) {
         let (m, n_u, nodes) = (samples.states.len(), self.gradient.len(), equations.nodes());
@@ -707,11 +724,11 @@ impl FitScratch {
 
     /// Where the members are without the samples.
     #[inline(always)]
-    fn begin<M: LaneModel>(
+    fn begin<M: LaneModel, const N: usize>(
         &mut self,
         samples: &Samples<'_>,
         freedom: &Freedom<'_>,
-        path: &Path<'_, M>,
+        path: &Path<'_, M, N>,
         theta: &[Lanes],
     ) {
         let m = samples.states.len();
@@ -777,14 +794,14 @@ impl FitScratch {
     /// where no coordinate moved further than its limit.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
-    fn place<M: LaneModel>(
+    fn place<M: LaneModel, const N: usize>(
         &mut self,
         model: &M,
-        equations: &mut Equations<'_, M>,
+        equations: &mut Equations<'_, M, N>,
         samples: &Samples<'_>,
         freedom: &Freedom<'_>,
-        (dual, states): (&Dual<'_, M>, &AtNodes<M::State>),
-        (mean, path): (M::State, &mut Path<'_, M>),
+        (dual, states): (&Dual<'_, M, N>, &AtNodes<M::State, N>),
+        (mean, path): (M::State, &mut Path<'_, M, N>),
         solutions: &mut Solutions,
     ) -> Lanes {
         let unknowns = freedom.unknowns;

@@ -130,7 +130,7 @@ fn tracked_delta_is_the_flow_that_is_missing() {
     settings.channels.iter_mut().for_each(|c| c.noise_sd_mmhg = 1e-6);
     let mut patient =
         Simulator::new(truth, config.patient.initial_pressures().unwrap(), config.patient.theta(), vec![]);
-    let mut ensemble = Ensemble::new(config.circulation().unwrap(), settings, 0.0, &Serial).unwrap();
+    let mut ensemble = Ensemble::new(config.circulation().unwrap(), settings, &Serial).unwrap();
     let mut scratch = Snapshot::default();
     let (mut error, mut size) = (0.0, 0.0);
     for window in 0..170 {
@@ -173,7 +173,7 @@ fn the_models_part_of_the_band_is_published() {
     let without = with_set(&Config::default(), "estimator.members=40");
     for (config, discrepant) in [(with, true), (without, false)] {
         let settings = config.estimator_settings().unwrap();
-        let mut ensemble = Ensemble::new(config.circulation().unwrap(), settings, 0.0, &Serial).unwrap();
+        let mut ensemble = Ensemble::new(config.circulation().unwrap(), settings, &Serial).unwrap();
         for _ in 0..100 {
             ensemble.step(&[], &Serial);
         }
@@ -198,8 +198,8 @@ fn the_models_part_of_the_band_is_published() {
 fn no_discrepancy_changes_nothing() {
     let config = with_set(&Config::default(), "estimator.members=8");
     let settings = config.estimator_settings().unwrap();
-    let mut plain = Ensemble::new(config.patient.model(), settings.clone(), 0.0, &Serial).unwrap();
-    let mut wrapped = Ensemble::new(config.circulation().unwrap(), settings, 0.0, &Serial).unwrap();
+    let mut plain = Ensemble::new(config.patient.model(), settings.clone(), &Serial).unwrap();
+    let mut wrapped = Ensemble::new(config.circulation().unwrap(), settings, &Serial).unwrap();
     for k in 0..50 {
         let observations = [Observation { s: 0.5, channel: 1, value: 90.0 + f64::from(k) }];
         plain.step(&observations, &Serial);
@@ -233,10 +233,10 @@ fn explained_share_is_that_of_regression() {
 fn saturated_features_are_drawn_again() {
     let config = with_set(&Config::default(), "window.biases={ normal = [0.0, 30.0] }");
     let settings = config.estimator_settings().unwrap();
-    let ensemble = Ensemble::new(config.circulation().unwrap(), settings, 0.0, &Serial).unwrap();
+    let ensemble = Ensemble::new(config.circulation().unwrap(), settings, &Serial).unwrap();
     assert_eq!(ensemble.len(), 100);
     let hopeless = with_set(&Config::default(), "window.biases={ uniform = [100.0, 200.0] }");
     let settings = hopeless.estimator_settings().unwrap();
-    let refused = Ensemble::new(hopeless.circulation().unwrap(), settings, 0.0, &Serial).map(|_| ()).unwrap_err();
+    let refused = Ensemble::new(hopeless.circulation().unwrap(), settings, &Serial).map(|_| ()).unwrap_err();
     assert!(refused.to_string().contains("span nothing"), "{refused}");
 }

@@ -110,7 +110,7 @@ fn coupled_and_its_rivals_are_the_kalman_filter_of_a_linear_model() {
 fn compare_with_the_kalman_filter(coupling: CouplingKind) {
     let members = 40;
     let settings = EstimatorSettings { coupling, ..settings(members) };
-    let mut ensemble = Ensemble::new(Linear, settings, 0.0, &Serial).unwrap();
+    let mut ensemble = Ensemble::new(Linear, settings, &Serial).unwrap();
     let mut rng = ChaCha8Rng::seed_from_u64(3);
     let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
     let mut truth = Vector3::new(0.0, 0.5, 2.5);

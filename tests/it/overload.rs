@@ -31,7 +31,7 @@ fn rows(ensemble: &Ensemble<Cvsim6>) -> Vec<Vec<f64>> {
 fn mean_and_spread_are_kept_when_members_rest_and_when_they_come_back() {
     let settings = super::twin::settings(CouplingKind::Coupled, &[State::A, State::Pa], &[Parameter::RPv]);
     let settings = EstimatorSettings { members: 100, ..settings };
-    let mut ensemble = Ensemble::new(Cvsim6::default(), settings, 0.0, &Serial).unwrap();
+    let mut ensemble = Ensemble::new(Cvsim6::default(), settings, &Serial).unwrap();
     (0..40).for_each(|_| _ = ensemble.step(&[], &Serial));
     let before = rows(&ensemble);
     for (members, expected) in [(50, 56), (20, 24), (3, 16), (60, 64), (1000, 100)] {

@@ -144,16 +144,11 @@ pub struct Ensemble<M: Model> {
 }
 
 impl<M: Model> Ensemble<M> {
-    /// Draws all members; the clocks of the model are moved to `start_s` of event time.
+    /// Draws all members, at event time 0; see [`Ensemble::starting_at`].
     ///
     /// # Errors
     /// When the settings do not fit the model.
-    pub fn new(
-        model: M,
-        settings: EstimatorSettings,
-        start_s: f64,
-        parallel: &dyn Parallel,
-    ) -> Result<Self, SettingsError> {
+    pub fn new(model: M, settings: EstimatorSettings, parallel: &dyn Parallel) -> Result<Self, SettingsError> {
         check(&model, &settings)?;
         let estimated = with_companions(&model, &settings.estimate);
         let transforms: Vec<_> = estimated.iter().map(|&p| model.parameters()[p].transform).collect();
@@ -163,9 +158,7 @@ impl<M: Model> Ensemble<M> {
         };
         let varying = varying(&model, &estimated, &settings.theta);
         let mut rng = ChaCha8Rng::seed_from_u64(settings.seed);
-        let mut theta = settings.theta.clone();
-        model.advance(start_s, &mut theta);
-
+        let theta = settings.theta.clone();
         let (n, m) = (model.n_states(), settings.members);
         let bases = draw_bases(&model, &settings, &mut rng, parallel)?;
         let draws = exact_normals(n + estimated.len(), m, &[], &mut rng, settings.instructions);
@@ -234,6 +227,27 @@ impl<M: Model> Ensemble<M> {
                 Some(Unscented::new(&ensemble.rows(), m, &mut ensemble.rng, ensemble.settings.instructions));
         }
         Ok(ensemble)
+    }
+
+    /// The same members, with the clocks of the model moved to `start_s` of event time. What they have in common is drawn
+    /// once for all beds.
+    #[must_use]
+    pub fn starting_at(&self, start_s: f64) -> Self {
+        let mut ensemble = self.clone();
+        let mut theta = self.settings.theta.clone();
+        self.model.advance(start_s, &mut theta);
+        let moved = |p: usize| theta[p] - self.settings.theta[p];
+        for batch in &mut ensemble.batches {
+            // All alike: by its own rate, a member would be anywhere by then.
+            self.varying.iter().for_each(|&p| batch.theta[p] = batch.theta[p] + Lanes::splat(moved(p)));
+            batch.stand_still();
+        }
+        for (k, &p) in self.estimated.iter().enumerate().filter(|(_, p)| moved(**p).abs() > 0.0) {
+            let belief = &self.settings.beliefs[p];
+            ensemble.centre[k] = self.transforms[k].forward(theta[p]);
+            ensemble.paces[k] = Pace::new(belief.drift, belief.reversion, ensemble.centre[k], belief.sd);
+        }
+        ensemble
     }
 
     /// The model.
