@@ -14,6 +14,9 @@ use hemostream::model::Model;
 use hemostream::model::cvsim6::Cvsim6;
 use hemostream::model::discrepancy::Circulation;
 use hemostream::model::truth::Simulator;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 
 /// Seconds before the one that is timed: what is estimated has been found by then.
 const BEFORE_S: i64 = 5;
@@ -32,13 +35,14 @@ fn going(sets: &[&str], rate_hz: i64) -> Going {
     let theta = model.default_parameters();
     let mut patient = Simulator::new(model, Cvsim6::initial_pressures(&theta).unwrap(), theta, vec![]);
     let (mut next, mut out) = (Vec::new(), Vec::new());
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
     for k in 0..(BEFORE_S + 1) * rate_hz {
         let time = EventTime(k * 1_000_000_000 / rate_hz);
         patient.advance_to(time.as_s()).unwrap();
         for (channel, sensor) in channels.iter().enumerate() {
-            // Enough like noise.
-            let noise = sensor.noise_sd_mmhg * 1.4 * (12.9898 * k as f64 + 78.233 * channel as f64).sin();
-            let sample = RawSample { time, value: patient.state()[sensor.state] + noise };
+            let noise: f64 = StandardNormal.sample(&mut rng);
+            let value = patient.state()[sensor.state] + sensor.noise_sd_mmhg * noise;
+            let sample = RawSample { time, value };
             if k < BEFORE_S * rate_hz {
                 let input = Input::Samples { channel, samples: vec![sample] };
                 estimator.handle(input, ArrivalTime(time.0), &Serial, &mut out);

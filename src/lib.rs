@@ -42,6 +42,9 @@
 //! | a patient to validate with | a file in `config/patients`, and its line in [`validate::patients`] |
 //! | something that an estimator may be told wrongly | a variant of [`validate::scenario::Scenario`] |
 
+pub mod benchmarks {
+    #![doc = include_str!("benchmarks.md")]
+}
 pub mod edge;
 pub mod estimate;
 pub mod model;

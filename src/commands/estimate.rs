@@ -75,7 +75,7 @@ impl Estimate {
         let seconds = check_record(input, &config)?;
         let reader = Record::open(input, &config)?;
         let mut run = Run::new(&config, self, &reader, seconds)?;
-        workers.install(|| {
+        workers.concentrate(|| {
             run.record(reader, &workers)?;
             run.finish(&workers)
         })

@@ -1,5 +1,7 @@
 //! A fixed pool of threads for the solves.
 
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
 use rayon::iter::{IndexedParallelIterator, IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
 
 use crate::estimate::ensemble::{Batch, Parallel};
@@ -45,6 +47,31 @@ impl Workers {
         self.pool.install(job)
     }
 
+    /// Runs `job` in this pool with all other threads awake and waiting for parts of it: those of a window are so short
+    /// that a thread that sleeps would come too late. Meant for one job that is to be done as fast as the machine goes.
+    pub fn concentrate<T: Send>(&self, job: impl FnOnce() -> T + Send) -> T {
+        let (awake, over) = (AtomicUsize::new(0), AtomicBool::new(false));
+        let keep_awake = || {
+            awake.fetch_add(1, Ordering::Relaxed);
+            while !over.load(Ordering::Relaxed) {
+                if rayon::yield_now() != Some(rayon::Yield::Executed) {
+                    std::hint::spin_loop();
+                }
+            }
+        };
+        self.pool.install(|| {
+            rayon::scope(|scope| {
+                let _end = OnDrop(&over);
+                (1..self.threads()).for_each(|_| scope.spawn(|_| keep_awake()));
+                // They must not be left to this thread, which would then wait for itself.
+                while awake.load(Ordering::Relaxed) + 1 < self.threads() {
+                    std::hint::spin_loop();
+                }
+                job()
+            })
+        })
+    }
+
     /// Does `job` for every item, side by side; results in the order of the items.
     pub fn map<T: Sync, R: Send>(&self, items: &[T], job: impl Fn(&T) -> R + Send + Sync) -> Vec<R> {
         self.pool.install(|| items.par_iter().with_max_len(1).map(job).collect())
@@ -53,6 +80,15 @@ impl Workers {
     /// Runs `job` on some thread of the pool, some time.
     pub fn spawn(&self, job: impl FnOnce() + Send + 'static) {
         self.pool.spawn(job);
+    }
+}
+
+/// Says so when it is over, also by a panic.
+struct OnDrop<'a>(&'a AtomicBool);
+
+impl Drop for OnDrop<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
     }
 }
 
