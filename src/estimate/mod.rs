@@ -5,7 +5,7 @@
 //! | [`time`] | event time and arrival time, which must not be mixed up |
 //! | [`settings`] | everything an estimator is told at the start |
 //! | [`window`] | samples in, closed windows out: event time, lateness, gaps, disorder |
-//! | [`ensemble`] | the members, one step of all of them, the second look, their clocks, what they say together |
+//! | [`ensemble`] | the members, one step of all of them, the second look, their clocks, how many take part, what they say together |
 //! | [`batch`] | eight members: their features, states and parameters, and one window of work on them |
 //! | [`coupling`] | what is free in a window and what the prior is: `independent`, `coupled` |
 //! | [`random`] | noise over the members with exact moments |
