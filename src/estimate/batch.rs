@@ -28,6 +28,8 @@ pub(super) struct Tools<'a, M: Model> {
     pub lanes: Option<&'a M::Lanes>,
     pub settings: &'a EstimatorSettings,
     pub unknowns: &'a Unknowns,
+    /// Estimated parameters.
+    pub estimated: &'a [usize],
     /// Parameters that are not the same for ever: what is estimated, and clocks.
     pub varying: &'a [usize],
 }
@@ -349,10 +351,10 @@ impl Batch {
     }
 
     /// Goes to the end of the window; clocks move on by `h`.
-    pub(super) fn move_on<M: Model>(&mut self, tools: &Tools<'_, M>, estimated: &[usize], h: f64) {
+    pub(super) fn move_on<M: Model>(&mut self, tools: &Tools<'_, M>, h: f64) {
         self.x.clone_from(&self.window.end);
         tools.varying.iter().for_each(|&p| self.theta[p] = self.window.theta[p]);
-        for &p in estimated {
+        for &p in tools.estimated {
             let (low, high) = tools.settings.beliefs[p].bounds;
             for value in &mut self.theta[p].0[..self.count] {
                 let inside = value.clamp(low, high);
@@ -406,8 +408,9 @@ impl Batch {
         advance(tools, h, &mut self.theta);
     }
 
-    /// Parameters at the start of a window of `h` from those at its end.
+    /// The end of a window of `h` is where the members are now; the parameters at its start follow from that.
     pub(super) fn start_from_end<M: Model>(&mut self, tools: &Tools<'_, M>, h: f64) {
+        self.window.end.clone_from(&self.x);
         self.window.theta.clone_from(&self.theta);
         advance(tools, -h, &mut self.window.theta);
     }

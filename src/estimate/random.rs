@@ -10,7 +10,7 @@
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use super::statistics::{dot, sum};
+use super::statistics::{dot, norm, sum};
 use crate::model::lanes::InstructionSet;
 
 /// Rows over the members, as an orthonormal and centred set.
@@ -65,7 +65,7 @@ impl Directions {
 
     /// Adds a row that has been reduced.
     fn add_reduced(&mut self, row: &[f64]) {
-        let length = length(row);
+        let length = norm(row);
         self.rows.extend(row.iter().map(|r| r / length));
     }
 
@@ -92,21 +92,15 @@ impl pulp::NullaryFnOnce for Reduction<'_> {
         let Self { directions, row, passes } = self;
         let mean = sum(row, |v| v) / row.len() as f64;
         row.iter_mut().for_each(|v| *v -= mean);
-        let before = length(row);
+        let before = norm(row);
         for _ in 0..passes {
             for direction in directions.chunks_exact(row.len().max(1)) {
                 let along = dot(direction, row);
                 row.iter_mut().zip(direction).for_each(|(r, d)| *r -= along * d);
             }
         }
-        if before > 0.0 { length(row) / before } else { 0.0 }
+        if before > 0.0 { norm(row) / before } else { 0.0 }
     }
-}
-
-#[allow(clippy::inline_always)]
-#[inline(always)]
-fn length(row: &[f64]) -> f64 {
-    sum(row, |v| v * v).sqrt()
 }
 
 /// `rows x members` standard normals, row-major: centred, of sample variance 1 and, where there are members enough,
@@ -132,7 +126,7 @@ pub fn exact_normals<R: Rng>(
         out.extend((0..members).map(|_| -> f64 { StandardNormal.sample(rng) }));
         let row = &mut out[at..];
         taken.reduce_random(row);
-        let length = length(row);
+        let length = norm(row);
         if length > 0.0 {
             row.iter_mut().for_each(|v| *v *= target / length);
         }

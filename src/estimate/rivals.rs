@@ -47,7 +47,7 @@ impl<M: Model> Ensemble<M> {
         let members = self.len();
         let (rows, sd) = (self.rows(), self.stated_noise(observations));
         let expected = expectations(&self.batches, sd.len());
-        let noise = exact_normals(sd.len(), members, &rows, &mut self.rng, self.settings.instructions);
+        let noise = self.draw(sd.len(), &rows);
         let m = sd.len();
         let innovation = with_noise(covariance(&expected, &expected, members), &sd);
         report.innovations = (0..m)
@@ -183,26 +183,12 @@ impl<M: Model> Ensemble<M> {
 
     /// Sets states and parameters at the end of the window from `rows` `[n_u x n_members]`.
     fn place(&mut self, rows: &[f64], h: f64) {
-        let (members, n) = (self.len(), self.model.n_states());
-        let Self { batches, estimated, transforms, settings, .. } = self;
-        for batch in batches.iter_mut() {
-            let (first, count) = (batch.first(), batch.len());
-            let own = |row: usize| &rows[row * members + first..][..count];
-            for s in 0..n {
-                batch.x[s].0[..count].copy_from_slice(own(s));
-            }
-            for (k, &p) in estimated.iter().enumerate() {
-                for (value, u) in batch.theta[p].0.iter_mut().zip(own(n + k)) {
-                    *value = settings.beliefs[p].value(transforms[k], *u);
-                }
-            }
-            batch.fill_up();
-            batch.window.end.clone_from(&batch.x);
-        }
+        self.place_from(0, rows);
         self.each(&Serial, |tools, batch| batch.start_from_end(tools, h));
     }
 
-    fn stated_noise(&self, observations: &[Observation]) -> Vec<f64> {
+    /// The noise that each sample is said to have.
+    pub(super) fn stated_noise(&self, observations: &[Observation]) -> Vec<f64> {
         observations.iter().map(|o| self.settings.channels[o.channel].noise_sd_mmhg).collect()
     }
 }

@@ -136,7 +136,10 @@ pub(super) fn centred(values: &[f64]) -> Vec<f64> {
     values.iter().map(|v| v - mean).collect()
 }
 
-fn norm(values: &[f64]) -> f64 {
+/// Length of a row.
+#[allow(clippy::inline_always)]
+#[inline(always)]
+pub(super) fn norm(values: &[f64]) -> f64 {
     dot(values, values).sqrt()
 }
 

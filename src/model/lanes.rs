@@ -56,13 +56,6 @@ impl Lanes {
         out
     }
 
-    /// Of eight numbers in a row.
-    #[must_use]
-    #[inline(always)]
-    pub fn load(row: &[f64; WIDTH]) -> Self {
-        Self(*row)
-    }
-
     /// The nearest whole number, for numbers below 2^51.
     #[must_use]
     #[inline(always)]

@@ -186,11 +186,6 @@ pub struct Extent {
     pub change: f64,
 }
 
-impl Extent {
-    /// Of nothing yet.
-    pub const EMPTY: Self = Self { min: f64::INFINITY, max: f64::NEG_INFINITY, mean: 0.0, change: 0.0 };
-}
-
 /// A system of ordinary differential equations with exact first derivatives.
 ///
 /// Time `t` is measured from the start of the current window. Whatever must survive from window to window

@@ -2,7 +2,6 @@
 
 use super::{Batch, Ensemble, Parallel};
 use crate::estimate::batch::{read, write};
-use crate::estimate::random::exact_normals;
 use crate::estimate::timing::{ClockEdit, WAITING_PHASE};
 use crate::model::Model;
 
@@ -51,7 +50,7 @@ impl<M: Model> Ensemble<M> {
     /// Gives the states the spread that they started with: they have run by a wrong clock.
     fn spread_anew(&mut self) {
         let (n, m) = (self.model.n_states(), self.len());
-        let draws = exact_normals(n, m, &self.rows(), &mut self.rng, self.settings.instructions);
+        let draws = self.draw(n, &self.rows());
         for (s, row) in draws.chunks_exact(m).enumerate() {
             let sd = self.settings.initial_state_sd[s];
             self.add_to_state(s, sd, row);
@@ -93,7 +92,7 @@ impl<M: Model> Ensemble<M> {
         self.clock_waits = false;
         let m = self.len();
         let known = !self.estimated.contains(&cycle.rate);
-        let draws = exact_normals(2, m, &self.rows(), &mut self.rng, self.settings.instructions);
+        let draws = self.draw(2, &self.rows());
         if let Some(rate) = rate {
             let (low, high) = self.settings.beliefs[cycle.rate].bounds;
             let sd = if known { 0.0 } else { RATE_SD };

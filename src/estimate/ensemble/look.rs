@@ -3,7 +3,6 @@
 use super::{Ensemble, Observation, Parallel, WindowReport};
 use crate::estimate::batch::{SharedPrior, expectations};
 use crate::estimate::coupling::coupled;
-use crate::estimate::random::exact_normals;
 use crate::estimate::smoother::Correction;
 use crate::estimate::statistics::mean_and_sd;
 use crate::model::Model;
@@ -55,7 +54,7 @@ impl<M: Model> Ensemble<M> {
             return WindowReport { innovations: judged.innovations, expected: judged.expected, ..report };
         }
         let (rows, m) = (self.rows(), self.len());
-        let noise = exact_normals(observations.len(), m, &rows, &mut self.rng, self.settings.instructions);
+        let noise = self.draw(observations.len(), &rows);
         coupled::covariance_root(&rows, m, &mut self.root);
         let inflation = self.settings.drift.inflation.powf(h);
         if inflation > 1.0 {
@@ -95,8 +94,8 @@ impl<M: Model> Ensemble<M> {
         self.look_forward(observations, parallel);
         let expected = expectations(&self.batches, observations.len());
         let judged = self.judge(observations, &expected);
-        let sd: Vec<f64> = observations.iter().map(|o| self.settings.channels[o.channel].noise_sd_mmhg).collect();
-        let noise = exact_normals(observations.len(), self.len(), &[], &mut self.rng, self.settings.instructions);
+        let sd = self.stated_noise(observations);
+        let noise = self.draw(observations.len(), &[]);
         let before = self.coordinates();
         let report = self.learn(observations, (&sd, &noise), (None, &before), parallel);
         WindowReport { innovations: judged.innovations, expected: judged.expected, ..report }

@@ -358,8 +358,7 @@ impl<M: Model> Ensemble<M> {
             .filter(|(_, keep, sd)| *sd > 0.0 || *keep < 1.0)
             .collect();
         let m = self.len();
-        let draws =
-            exact_normals(states.len() + parameters.len(), m, &self.rows(), &mut self.rng, self.settings.instructions);
+        let draws = self.draw(states.len() + parameters.len(), &self.rows());
         for (row, &(state, sd)) in draws.chunks_exact(m).zip(&states) {
             self.add_to_state(state, sd, row);
         }
@@ -376,6 +375,33 @@ impl<M: Model> Ensemble<M> {
                 batch.fill_up();
             }
         }
+    }
+
+    /// Sets states and parameter coordinates of the batches from `first` on, `[n_u x their members]`.
+    pub(super) fn place_from(&mut self, first: usize, rows: &[f64]) {
+        let Self { batches, estimated, transforms, settings, model, .. } = self;
+        let (n, batches) = (model.n_states(), &mut batches[first..]);
+        let offset = batches.first().map_or(0, Batch::first);
+        let members: usize = batches.iter().map(Batch::len).sum();
+        for batch in batches {
+            let (at, count) = (batch.first() - offset, batch.len());
+            let own = |row: usize| &rows[row * members + at..][..count];
+            for s in 0..n {
+                batch.x[s].0[..count].copy_from_slice(own(s));
+            }
+            for (k, &p) in estimated.iter().enumerate() {
+                for (value, u) in batch.theta[p].0.iter_mut().zip(own(n + k)) {
+                    *value = settings.beliefs[p].value(transforms[k], *u);
+                }
+            }
+            batch.fill_up();
+        }
+    }
+
+    /// Standard normals over the members, see `random`.
+    pub(super) fn draw(&mut self, rows: usize, against: &[f64]) -> Vec<f64> {
+        let members = self.len();
+        exact_normals(rows, members, against, &mut self.rng, self.settings.instructions)
     }
 
     /// Adds `sd` times the draws of the members to a state.
@@ -410,8 +436,8 @@ impl<M: Model> Ensemble<M> {
 
     /// One batch after the other or side by side.
     pub(super) fn each(&mut self, parallel: &dyn Parallel, job: impl Fn(&Tools<'_, M>, &mut Batch) + Sync) {
-        let Self { model, lanes, settings, unknowns, varying, batches, .. } = self;
-        let tools = Tools { model, lanes: lanes.as_ref(), settings, unknowns, varying };
+        let Self { model, lanes, settings, unknowns, estimated, varying, batches, .. } = self;
+        let tools = Tools { model, lanes: lanes.as_ref(), settings, unknowns, estimated, varying };
         parallel.for_each(batches, &|batch| job(&tools, batch));
     }
 
@@ -425,18 +451,18 @@ impl<M: Model> Ensemble<M> {
 
     /// A window that nothing is learnt from.
     fn forecast(&mut self, parallel: &dyn Parallel) -> WindowReport {
-        let (h, estimated) = (self.clock_step_s(), self.estimated.clone());
+        let h = self.clock_step_s();
         self.each(parallel, |tools, batch| {
             batch.forecast(tools);
-            batch.move_on(tools, &estimated, h);
+            batch.move_on(tools, h);
         });
         self.account()
     }
 
     /// To the end of a window that was looked through already.
     fn go_on(&mut self, parallel: &dyn Parallel) -> WindowReport {
-        let (h, estimated) = (self.clock_step_s(), self.estimated.clone());
-        self.each(parallel, |tools, batch| batch.move_on(tools, &estimated, h));
+        let h = self.clock_step_s();
+        self.each(parallel, |tools, batch| batch.move_on(tools, h));
         self.account()
     }
 
@@ -448,11 +474,11 @@ impl<M: Model> Ensemble<M> {
         (shared, before): (Option<SharedPrior<'_>>, &[(f64, f64)]),
         parallel: &dyn Parallel,
     ) -> WindowReport {
-        let (h, estimated) = (self.clock_step_s(), self.estimated.clone());
+        let h = self.clock_step_s();
         let lesson = Lesson { observations, sd, noise, members: self.len(), shared };
         self.each(parallel, |tools, batch| {
             batch.fit(tools, &lesson);
-            batch.move_on(tools, &estimated, h);
+            batch.move_on(tools, h);
         });
         let mut report = self.account();
         report.informed = self.compare(before);

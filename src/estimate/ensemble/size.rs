@@ -78,26 +78,10 @@ impl<M: Model> Ensemble<M> {
         self.place_all(&moments.spread(&draws, m), first);
     }
 
-    /// Sets states and parameter coordinates of the batches from `first` on, `[n_u x their members]`, between two windows.
+    /// Between two windows: sets the batches from `first` on, and forgets how they got there.
     fn place_all(&mut self, rows: &[f64], first: usize) {
-        let Self { batches, estimated, transforms, settings, model, .. } = self;
-        let (n, batches) = (model.n_states(), &mut batches[first..]);
-        let offset = batches.first().map_or(0, super::Batch::first);
-        let m: usize = batches.iter().map(super::Batch::len).sum();
-        for batch in batches {
-            let (at, count) = (batch.first() - offset, batch.len());
-            let row = |k: usize| &rows[k * m + at..][..count];
-            for s in 0..n {
-                batch.x[s].0[..count].copy_from_slice(row(s));
-            }
-            for (k, &p) in estimated.iter().enumerate() {
-                for (value, u) in batch.theta[p].0.iter_mut().zip(row(n + k)) {
-                    *value = settings.beliefs[p].value(transforms[k], *u);
-                }
-            }
-            batch.fill_up();
-            batch.stand_still();
-        }
+        self.place_from(first, rows);
+        self.batches[first..].iter_mut().for_each(super::Batch::stand_still);
     }
 }
 

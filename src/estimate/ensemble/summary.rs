@@ -59,8 +59,8 @@ impl<M: Model> Ensemble<M> {
     }
 
     pub(in crate::estimate) fn tools(&self) -> Tools<'_, M> {
-        let Self { model, lanes, settings, unknowns, varying, .. } = self;
-        Tools { model, lanes: lanes.as_ref(), settings, unknowns, varying }
+        let Self { model, lanes, settings, unknowns, estimated, varying, .. } = self;
+        Tools { model, lanes: lanes.as_ref(), settings, unknowns, estimated, varying }
     }
 
     /// One summary per quantity of [`Ensemble::snapshot`].
