@@ -98,9 +98,11 @@ impl Coupled {
                 }
             })
             .collect();
+        let mut covariance = Vec::new();
+        square(&root, 8, &mut covariance);
         Self {
             unknowns: coupled_unknowns(model, &chosen, &transforms),
-            covariance: square(&root, 8),
+            covariance,
             root,
             weights: OBSERVED.iter().map(|s| 1.0 / NOISE[*s as usize]).collect(),
             states: OBSERVED.iter().map(|s| *s as usize).collect(),

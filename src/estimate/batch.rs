@@ -576,16 +576,10 @@ fn copy(from: &[Lanes], of: usize, to: &mut [Lanes], lane: usize) {
     to.iter_mut().zip(from).for_each(|(to, from)| to.0[lane] = from.0[of]);
 }
 
-/// Row by row over all members: `row(batch)` of every batch, without the lanes that are filled up.
-pub(super) fn gather(batches: &[Batch], out: &mut Vec<f64>, row: impl Fn(&Batch) -> Lanes) {
-    for batch in batches {
-        out.extend_from_slice(&row(batch).0[..batch.count]);
+/// What members expect of the samples of a window, `[n_observations x n_members]`, into `out`.
+pub(super) fn read_expectations(batches: &[Batch], observations: usize, out: &mut Vec<f64>) {
+    out.clear();
+    for j in 0..observations {
+        batches.iter().for_each(|batch| out.extend_from_slice(&batch.expected[j].0[..batch.count]));
     }
-}
-
-/// What members expect of the samples of a window, `[n_observations x n_members]`.
-pub(super) fn expectations(batches: &[Batch], observations: usize) -> Vec<f64> {
-    let mut out = Vec::with_capacity(observations * batches.len() * WIDTH);
-    (0..observations).for_each(|j| gather(batches, &mut out, |batch| batch.expected[j]));
-    out
 }

@@ -16,7 +16,7 @@ pub struct BeatEstimate {
 }
 
 /// Follows the members through a beat.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Default)]
 pub struct BeatFollower {
     /// Time and beats counted by the clock of the ensemble, when last heard of.
     last: Option<(EventTime, f64)>,
@@ -29,6 +29,25 @@ pub struct BeatFollower {
     first: Vec<f64>,
     /// How far the clock of each member was ahead of that of the ensemble at the start \[beats\].
     ahead: Vec<f64>,
+}
+
+impl Clone for BeatFollower {
+    fn clone(&self) -> Self {
+        let mut clone = Self::default();
+        clone.clone_from(self);
+        clone
+    }
+
+    /// Into the vectors that are there.
+    fn clone_from(&mut self, other: &Self) {
+        let Self { last, onset_s, smallest, largest, integral, first, ahead } = other;
+        (self.last, self.onset_s) = (*last, *onset_s);
+        self.smallest.clone_from(smallest);
+        self.largest.clone_from(largest);
+        self.integral.clone_from(integral);
+        self.first.clone_from(first);
+        self.ahead.clone_from(ahead);
+    }
 }
 
 impl BeatFollower {

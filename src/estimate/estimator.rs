@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::adapt::fit::ChannelFit;
-use super::ensemble::{Ensemble, Observation, Parallel, Serial, Snapshot, WindowReport, with_companions};
+use super::ensemble::{Ensemble, Observation, Parallel, Serial, Snapshot, with_companions};
 pub use super::messages::{ChannelHealth, Disagreement, Estimate, Input, Notice, NoticeKind, Output, WindowDone};
 use super::settings::{EstimatorSettings, SettingsError};
 use super::signal::quality::{Change, Quality, QualitySettings};
@@ -83,7 +83,18 @@ pub struct Estimator<M: Model> {
     want_members: bool,
     /// Members to go on with.
     members: usize,
-    scratch: Snapshot,
+    scratch: Scratch,
+}
+
+/// Reused from window to window.
+#[derive(Debug, Clone, Default)]
+struct Scratch {
+    /// Samples of undisturbed sensors.
+    used: Vec<Observation>,
+    heard: Vec<Heard>,
+    /// Channels that can be trusted with the beat.
+    usable: Vec<bool>,
+    snapshot: Snapshot,
 }
 
 impl<M: Model> Estimator<M> {
@@ -116,7 +127,7 @@ impl<M: Model> Estimator<M> {
             calm_since: Vec::new(),
             want_members: false,
             members,
-            scratch: Snapshot::default(),
+            scratch: Scratch::default(),
         })
     }
 
@@ -202,6 +213,7 @@ impl<M: Model> Estimator<M> {
         loop {
             while let Some(window) = self.cutter.next(now) {
                 self.solve(&window, parallel, out);
+                self.cutter.recycle(window);
             }
             if !self.cutter.needs_restart() {
                 break;
@@ -309,7 +321,8 @@ impl<M: Model> Estimator<M> {
             self.resize(out);
         }
         out.extend(window.gone_silent.iter().map(|&c| notice(window.end, NoticeKind::Gap, Some(c))));
-        let observations = self.screen(window, out);
+        let mut observations = std::mem::take(&mut self.scratch.used);
+        self.screen(window, &mut observations, out);
         let Some(ensemble) = &mut self.ensemble else { return };
 
         ensemble.listen(self.tracker.is_acquired());
@@ -322,7 +335,7 @@ impl<M: Model> Estimator<M> {
         } else if report.replaced > 0 {
             out.push(notice(window.end, NoticeKind::MembersReplaced(report.replaced), None));
         }
-        for &k in &report.moving {
+        for &k in &ensemble.findings().moving {
             // What is still being found out has not begun to move; and once said is enough.
             if window.end.ns_since(self.calm_since[k]) >= CALM_NS {
                 out.push(notice(window.end, NoticeKind::ParameterShift(self.estimated[k]), None));
@@ -331,20 +344,22 @@ impl<M: Model> Estimator<M> {
         }
         // Before the beat is found, samples are listened to but nothing is learnt of them.
         let learnt: &[Observation] = if self.tracker.is_acquired() { &observations } else { &[] };
-        self.tally(window.end, learnt, &report, out);
-        self.keep_time(window, &observations, &report, parallel, out);
+        self.tally(window.end, learnt, out);
+        self.keep_time(window, &observations, parallel, out);
         self.publish(window, learnt, first, out);
         self.put_out_beats(false, out);
         let samples = learnt.len();
         out.push(Output::Window(WindowDone { end: window.end, closed_at: window.closed_at, samples, report }));
+        self.scratch.used = observations;
     }
 
-    /// The samples of a window without those of disturbed sensors.
-    fn screen(&mut self, window: &ClosedWindow, out: &mut Vec<Output>) -> Vec<Observation> {
+    /// The samples of a window without those of disturbed sensors, into `used`.
+    fn screen(&mut self, window: &ClosedWindow, used: &mut Vec<Observation>, out: &mut Vec<Output>) {
+        used.clear();
         if !self.settings.live.screen_artefacts {
-            return window.observations.clone();
+            used.extend_from_slice(&window.observations);
+            return;
         }
-        let mut used = Vec::with_capacity(window.observations.len());
         for observation in &window.observations {
             let time = observed_at(window, observation);
             let verdict = self.tallies[observation.channel].quality.take(time.as_s(), observation.value);
@@ -357,7 +372,6 @@ impl<M: Model> Estimator<M> {
                 used.push(*observation);
             }
         }
-        used
     }
 
     /// Follows the beat, and sets the clocks of the members where it went its own way.
@@ -365,7 +379,6 @@ impl<M: Model> Estimator<M> {
         &mut self,
         window: &ClosedWindow,
         observations: &[Observation],
-        report: &WindowReport,
         parallel: &dyn Parallel,
         out: &mut Vec<Output>,
     ) {
@@ -375,13 +388,14 @@ impl<M: Model> Estimator<M> {
         let Some(ensemble) = &mut self.ensemble else { return };
         let (Some(beats), Some(rate_hz)) = (ensemble.cycles(), ensemble.rate_hz()) else { return };
         let clock = ClockReading { time_s: window.end.as_s(), beats, rate_hz };
-        let heard = observations.iter().zip(&report.expected).map(|(o, expected)| Heard {
+        let heard = observations.iter().zip(&ensemble.findings().expected).map(|(o, expected)| Heard {
             channel: o.channel,
             time_s: observed_at(window, o).as_s(),
             observed: o.value,
             expected: *expected,
         });
-        let heard: Vec<Heard> = heard.collect();
+        self.scratch.heard.clear();
+        self.scratch.heard.extend(heard);
         let found = if self.settings.live.timing == TimingSource::Told {
             let due = self.told.partition_point(|at| *at <= window.end);
             let onsets: Vec<f64> = self.told.drain(..due).map(EventTime::as_s).collect();
@@ -389,8 +403,9 @@ impl<M: Model> Estimator<M> {
         } else {
             let usable =
                 |i: usize| self.tallies[i].quality.state().is_none() && self.cutter.liveness(i).0 == Liveness::Live;
-            let usable: Vec<bool> = (0..self.tallies.len()).map(usable).collect();
-            self.tracker.listen(&heard, clock, &usable)
+            self.scratch.usable.clear();
+            self.scratch.usable.extend((0..self.tallies.len()).map(usable));
+            self.tracker.listen(&self.scratch.heard, clock, &self.scratch.usable)
         };
         for (said, kind) in [
             (found.acquired, NoticeKind::BeatFound),
@@ -408,7 +423,7 @@ impl<M: Model> Estimator<M> {
         }
     }
 
-    fn tally(&mut self, end: EventTime, observations: &[Observation], report: &WindowReport, out: &mut Vec<Output>) {
+    fn tally(&mut self, end: EventTime, observations: &[Observation], out: &mut Vec<Output>) {
         for (channel, tally) in self.tallies.iter_mut().enumerate() {
             let Some(fit) = self.ensemble.as_ref().map(|ensemble| ensemble.fit(channel)) else { continue };
             let now = fit.is_misfit();
@@ -420,7 +435,8 @@ impl<M: Model> Estimator<M> {
                 out.push(notice(end, kind, Some(channel)));
             }
         }
-        for (observation, innovation) in observations.iter().zip(&report.innovations) {
+        let Some(findings) = self.ensemble.as_ref().map(Ensemble::findings) else { return };
+        for (observation, innovation) in observations.iter().zip(&findings.innovations) {
             let tally = &mut self.tallies[observation.channel];
             tally.samples_used += 1;
             let square = innovation * innovation;
@@ -429,7 +445,7 @@ impl<M: Model> Estimator<M> {
                 *mean += INNOVATION_WEIGHT * (square - *mean);
             }
         }
-        for (at, informed) in self.informed.iter_mut().zip(&report.informed) {
+        for (at, informed) in self.informed.iter_mut().zip(&findings.informed) {
             if *informed {
                 *at = end;
             }
@@ -509,7 +525,7 @@ impl<M: Model> Estimator<M> {
             time,
             since_data_ns: last_data.map_or(0, |last| time.ns_since(last).max(0)),
             members: ensemble.len(),
-            quantities: ensemble.summarise_at(s, &mut self.scratch),
+            quantities: ensemble.summarise_at(s, &mut self.scratch.snapshot),
             parameters: parameters.map(|(p, at)| (p, time.ns_since(*at).max(0))).collect(),
             ensemble: self.want_members.then(|| ensemble.members_at_end()),
         }

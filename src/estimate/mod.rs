@@ -42,6 +42,7 @@
 pub mod adapt;
 pub mod batch;
 pub mod beat;
+pub mod cloud;
 pub mod coupling;
 pub mod ensemble;
 pub mod estimator;

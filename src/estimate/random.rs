@@ -7,134 +7,113 @@
 //! 2015). For a linear model the ensemble then has exactly the mean and covariance of the Kalman filter, whatever the
 //! number of members.
 
-use rand::Rng;
+use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use super::statistics::{dot, norm, sum};
+use super::cloud::{Cloud, centre, degrees};
+use super::statistics::dot;
 use crate::model::lanes::InstructionSet;
 
-/// Rows over the members, as an orthonormal and centred set.
-#[derive(Debug, Clone, Default)]
-pub struct Directions {
-    members: usize,
-    rows: Vec<f64>,
+/// Directions that are taken out of a row at a time.
+const GROUP: usize = 8;
+
+/// A source of exact normals. Their sequence does not depend on when they are drawn.
+#[derive(Debug, Clone)]
+pub struct Normals {
+    rng: ChaCha8Rng,
     instructions: InstructionSet,
-    rest: Vec<f64>,
+    /// Drawn and not used yet, the next one last.
+    ahead: Vec<f64>,
 }
 
-impl Directions {
-    /// No direction yet.
+impl Normals {
+    /// From a generator.
     #[must_use]
-    pub fn new(members: usize, instructions: InstructionSet) -> Self {
-        Self { members, rows: Vec::new(), instructions, rest: Vec::new() }
+    pub fn new(rng: ChaCha8Rng, instructions: InstructionSet) -> Self {
+        Self { rng, instructions, ahead: Vec::new() }
     }
 
-    /// Number of directions.
-    #[must_use]
-    pub fn len(&self) -> usize {
-        self.rows.len().checked_div(self.members).unwrap_or(0)
-    }
-
-    /// Whether there is none.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.rows.is_empty()
-    }
-
-    /// Centres `row` `[n_members]` and takes the directions out of it; returns what is left of its length, as a share.
-    pub fn reduce(&self, row: &mut [f64]) -> f64 {
-        // Twice, because once is not orthogonal to rounding.
-        self.instructions.run(Reduction { directions: &self.rows, row, passes: 2 })
-    }
-
-    /// The same for a random row, of which the directions are a small part: once is enough.
-    fn reduce_random(&self, row: &mut [f64]) {
-        self.instructions.run(Reduction { directions: &self.rows, row, passes: 1 });
-    }
-
-    /// Adds what `row` has beyond the directions known; nothing if that is rounding.
-    pub fn add(&mut self, row: &[f64]) {
-        let mut rest = std::mem::take(&mut self.rest);
-        rest.clear();
-        rest.extend_from_slice(row);
-        if self.reduce(&mut rest) > 1e-9 {
-            self.add_reduced(&rest);
+    /// Draws ahead as much as the next window may need, where it costs nothing: beside other work.
+    pub fn draw_ahead(&mut self, count: usize) {
+        if self.ahead.len() < count {
+            let missing = count - self.ahead.len();
+            // The next one last: what there is goes behind what comes after it.
+            let known = self.ahead.len();
+            self.ahead.resize(count, 0.0);
+            self.ahead.copy_within(0..known, missing);
+            for value in self.ahead[..missing].iter_mut().rev() {
+                *value = StandardNormal.sample(&mut self.rng);
+            }
         }
-        self.rest = rest;
     }
 
-    /// Adds a row that has been reduced.
-    fn add_reduced(&mut self, row: &[f64]) {
-        let length = norm(row);
-        self.rows.extend(row.iter().map(|r| r / length));
-    }
-
-    /// Projections of the centred `row` on the directions.
-    pub fn along<'a>(&'a self, row: &'a [f64]) -> impl Iterator<Item = f64> + 'a {
-        self.rows.chunks_exact(self.members.max(1)).map(move |d| d.iter().zip(row).map(|(a, b)| a * b).sum())
+    /// `rows x members` standard normals, row-major, into `out`: centred, of sample variance 1 and, where there are members
+    /// enough, orthogonal to each other and to the deviations of the members in `against`.
+    pub fn draw(&mut self, rows: usize, members: usize, against: Option<&Cloud>, out: &mut Vec<f64>) {
+        self.draw_ahead(rows * members);
+        out.clear();
+        let left = self.ahead.len() - rows * members;
+        out.extend(self.ahead.drain(left..).rev());
+        // Few members have too few directions left to be random in.
+        let exact = members > 2 * (rows + against.map_or(0, Cloud::len)) + 1;
+        let against = against.filter(|_| exact).map_or(&[][..], Cloud::directions);
+        self.instructions.run(Exact { members, against, exact, rows: out });
     }
 }
 
 /// What runs in code for an instruction set.
-struct Reduction<'a> {
-    directions: &'a [f64],
-    row: &'a mut [f64],
-    passes: usize,
+struct Exact<'a> {
+    members: usize,
+    against: &'a [f64],
+    exact: bool,
+    rows: &'a mut [f64],
 }
 
 #[allow(clippy::inline_always)]
-impl pulp::NullaryFnOnce for Reduction<'_> {
-    type Output = f64;
+impl pulp::NullaryFnOnce for Exact<'_> {
+    type Output = ();
 
-    #[allow(clippy::cast_precision_loss)]
     #[inline(always)]
-    fn call(self) -> f64 {
-        let Self { directions, row, passes } = self;
-        let mean = sum(row, |v| v) / row.len() as f64;
-        row.iter_mut().for_each(|v| *v -= mean);
-        let before = norm(row);
-        for _ in 0..passes {
-            for direction in directions.chunks_exact(row.len().max(1)) {
-                let along = dot(direction, row);
-                row.iter_mut().zip(direction).for_each(|(r, d)| *r -= along * d);
+    fn call(self) {
+        let Self { members, against, exact, rows } = self;
+        let degrees = degrees(members);
+        for i in 0..rows.len().checked_div(members).unwrap_or(0) {
+            let (known, rest) = rows.split_at_mut(i * members);
+            let row = &mut rest[..members];
+            centre(row);
+            take_out(row, against, degrees);
+            if exact {
+                take_out(row, known, degrees);
+            }
+            let variance = dot(row, row) / degrees;
+            if variance > 0.0 {
+                let factor = 1.0 / variance.sqrt();
+                for value in row {
+                    *value *= factor;
+                }
             }
         }
-        if before > 0.0 { norm(row) / before } else { 0.0 }
     }
 }
 
-/// `rows x members` standard normals, row-major: centred, of sample variance 1 and, where there are members enough,
-/// orthogonal to each other and to the rows of `against` `[any x members]`.
-#[allow(clippy::cast_precision_loss)]
-pub fn exact_normals<R: Rng>(
-    rows: usize,
-    members: usize,
-    against: &[f64],
-    rng: &mut R,
-    instructions: InstructionSet,
-) -> Vec<f64> {
-    let mut taken = Directions::new(members, instructions);
-    // Few members have too few directions left to be random in.
-    let exact = members > 2 * (rows + against.len() / members.max(1)) + 1;
-    if exact {
-        against.chunks_exact(members).for_each(|row| taken.add(row));
-    }
-    let mut out = Vec::with_capacity(rows * members);
-    let target = (members as f64 - 1.0).max(1.0).sqrt();
-    for _ in 0..rows {
-        let at = out.len();
-        out.extend((0..members).map(|_| -> f64 { StandardNormal.sample(rng) }));
-        let row = &mut out[at..];
-        taken.reduce_random(row);
-        let length = norm(row);
-        if length > 0.0 {
-            row.iter_mut().for_each(|v| *v *= target / length);
+/// Takes orthogonal directions of sample variance 1 (or none) out of a random row, of which they are a small part: once is
+/// enough.
+#[allow(clippy::inline_always)]
+#[inline(always)]
+fn take_out(row: &mut [f64], directions: &[f64], degrees: f64) {
+    let members = row.len();
+    for group in directions.chunks(GROUP * members) {
+        // All of a group at once: one after the other, each would have to wait for the one before.
+        let mut along = [0.0; GROUP];
+        for (along, direction) in along.iter_mut().zip(group.chunks_exact(members)) {
+            *along = dot(direction, row) / degrees;
         }
-        if exact {
-            taken.add_reduced(row);
+        for (along, direction) in along.iter().zip(group.chunks_exact(members)) {
+            for (value, d) in row.iter_mut().zip(direction) {
+                *value -= along * d;
+            }
         }
     }
-    out
 }
 
 #[cfg(test)]
@@ -142,17 +121,24 @@ mod tests {
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
-    use super::InstructionSet;
+    use super::{Cloud, InstructionSet, Normals};
 
-    fn exact_normals(rows: usize, members: usize, against: &[f64], rng: &mut ChaCha8Rng) -> Vec<f64> {
-        super::exact_normals(rows, members, against, rng, InstructionSet::best())
+    fn normals() -> Normals {
+        Normals::new(ChaCha8Rng::seed_from_u64(5), InstructionSet::best())
+    }
+
+    fn draw(normals: &mut Normals, rows: usize, members: usize, against: &[f64]) -> Vec<f64> {
+        let mut out = Vec::new();
+        let cloud = Cloud::of(against, members, InstructionSet::best());
+        normals.draw(rows, members, Some(&cloud), &mut out);
+        out
     }
 
     #[test]
     fn draws_are_centred_of_variance_one_and_orthogonal_to_each_other_and_to_what_is_given() {
-        let (members, mut rng) = (30, ChaCha8Rng::seed_from_u64(5));
-        let given = exact_normals(3, members, &[], &mut rng);
-        let all: Vec<f64> = given.iter().copied().chain(exact_normals(4, members, &given, &mut rng)).collect();
+        let (members, mut normals) = (30, normals());
+        let given = draw(&mut normals, 3, members, &[]);
+        let all: Vec<f64> = given.iter().copied().chain(draw(&mut normals, 4, members, &given)).collect();
         for (i, a) in all.chunks_exact(members).enumerate() {
             assert!(a.iter().sum::<f64>().abs() < 1e-12, "centred");
             for (j, b) in all.chunks_exact(members).enumerate() {
@@ -165,7 +151,17 @@ mod tests {
 
     #[test]
     fn two_members_still_differ() {
-        let draws = exact_normals(2, 2, &[1.0, -1.0], &mut ChaCha8Rng::seed_from_u64(5));
+        let draws = draw(&mut normals(), 2, 2, &[1.0, -1.0]);
         assert!(draws.chunks_exact(2).all(|row| (row[0] + row[1]).abs() < 1e-12 && row[0].abs() > 0.1));
+    }
+
+    #[test]
+    fn drawing_ahead_changes_nothing() {
+        let (mut one, mut other) = (normals(), normals());
+        let expected: Vec<Vec<f64>> = (1..6).map(|rows| draw(&mut one, rows, 10, &[])).collect();
+        for (rows, expected) in (1..6).zip(&expected) {
+            other.draw_ahead(7 * rows);
+            assert_eq!(draw(&mut other, rows, 10, &[]), *expected);
+        }
     }
 }

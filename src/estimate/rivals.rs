@@ -2,15 +2,14 @@
 //! Runge-Kutta scheme, know each sensor's noise and a constant process noise, and correct linearly at the end of a
 //! window for all of its samples at once.
 
-use rand::Rng;
-
-use super::batch::{Batch, expectations, read};
-use super::coupling::coupled::{covariance, gain, semidefinite_cholesky, with_noise};
+use super::batch::{Batch, read, read_expectations};
+use super::cloud::Cloud;
+use super::coupling::coupled::{covariance, gain, semidefinite_cholesky, square, with_noise};
 use super::ensemble::{Ensemble, Observation, Parallel, Serial, WindowReport};
-use super::random::exact_normals;
+use super::random::Normals;
 use super::statistics::mean_and_sd;
 use crate::model::Model;
-use crate::model::lanes::{InstructionSet, Lanes, WIDTH};
+use crate::model::lanes::{Lanes, WIDTH};
 
 /// Unscented Kalman filter over (state, parameter coordinates): mean, covariance, and a standard normal cloud that
 /// stands for the posterior wherever members are asked for.
@@ -26,12 +25,12 @@ pub(super) struct Unscented {
 }
 
 impl Unscented {
-    /// With the moments of `rows` `[n x n_members]`.
-    pub(super) fn new<R: Rng>(rows: &[f64], members: usize, rng: &mut R, instructions: InstructionSet) -> Self {
-        let n = rows.len() / members;
-        let mean: Vec<f64> = rows.chunks_exact(members).map(|row| mean_and_sd(row).0).collect();
-        let covariance = covariance(rows, rows, members);
-        Self { mean, covariance, cloud: exact_normals(n, members, &[], rng, instructions), points: Vec::new() }
+    /// With the moments of the members.
+    pub(super) fn new(members: &Cloud, normals: &mut Normals) -> Self {
+        let (mut covariance, mut cloud) = (Vec::new(), Vec::new());
+        square(members.root(), members.len(), &mut covariance);
+        normals.draw(members.len(), members.members(), None, &mut cloud);
+        Self { mean: members.mean().to_vec(), covariance, cloud, points: Vec::new() }
     }
 }
 
@@ -40,22 +39,22 @@ impl<M: Model> Ensemble<M> {
     pub(super) fn enkf_step(&mut self, observations: &[Observation], h: f64, parallel: &dyn Parallel) -> WindowReport {
         self.wander_for(h);
         self.each(parallel, |tools, batch| batch.look_ahead(tools, observations, h));
-        let mut report = WindowReport { solved: self.len(), ..Default::default() };
+        let report = WindowReport { solved: self.len(), ..Default::default() };
         if observations.is_empty() {
             return report;
         }
         let members = self.len();
-        let (rows, sd) = (self.rows(), self.stated_noise(observations));
-        let expected = expectations(&self.batches, sd.len());
-        let noise = self.draw(sd.len(), &rows);
+        let (mut rows, mut sd, mut expected) = (Vec::new(), Vec::new(), Vec::new());
+        self.read_rows(&mut rows);
+        self.stated_noise(observations, &mut sd);
+        read_expectations(&self.batches, sd.len(), &mut expected);
+        let noise = self.draw(sd.len());
         let m = sd.len();
         let innovation = with_noise(covariance(&expected, &expected, members), &sd);
-        report.innovations = (0..m)
-            .map(|j| {
-                let mean = mean_and_sd(&expected[j * members..][..members]).0;
-                (observations[j].value - mean) / innovation[j * m + j].sqrt()
-            })
-            .collect();
+        for (j, o) in observations.iter().enumerate() {
+            let mean = mean_and_sd(&expected[j * members..][..members]).0;
+            self.findings.innovations.push((o.value - mean) / innovation[j * m + j].sqrt());
+        }
         let before = self.coordinates();
         if let Some(gain) = gain(&covariance(&rows, &expected, members), &innovation, m) {
             let mut updated = rows;
@@ -68,13 +67,13 @@ impl<M: Model> Ensemble<M> {
             }
             self.place(&updated, h);
         }
-        report.informed = self.compare(&before);
+        self.compare(&before);
         report
     }
 
     /// Sigma points, their forecast, and the update of the moments.
     pub(super) fn ukf_step(&mut self, observations: &[Observation], h: f64) -> WindowReport {
-        let mut report = WindowReport { solved: self.len(), ..Default::default() };
+        let report = WindowReport { solved: self.len(), ..Default::default() };
         let Some(mut filter) = self.unscented.take() else { return report };
         let n = filter.mean.len();
         self.disturb(&mut filter, h);
@@ -82,16 +81,19 @@ impl<M: Model> Ensemble<M> {
 
         let points = self.sigma_points(&mut filter, observations, h);
         let m = observations.len();
-        let (ends, expected) = (self.rows_of(&filter.points), expectations(&filter.points, m));
+        let (mut ends, mut expected) = (Vec::new(), Vec::new());
+        self.read_rows_of(&filter.points, &mut ends);
+        read_expectations(&filter.points, m, &mut expected);
         let moments = |a: &[f64], b: &[f64]| weighted_covariance(a, b, points);
         filter.mean = ends.chunks_exact(points).map(weighted_mean).collect();
         filter.covariance = moments(&ends, &ends);
         if m > 0 {
-            let sd = self.stated_noise(observations);
+            let mut sd = Vec::new();
+            self.stated_noise(observations, &mut sd);
             let innovation = with_noise(moments(&expected, &expected), &sd);
             let off: Vec<f64> =
                 expected.chunks_exact(points).zip(observations).map(|(row, o)| o.value - weighted_mean(row)).collect();
-            report.innovations = (0..m).map(|j| off[j] / innovation[j * m + j].sqrt()).collect();
+            self.findings.innovations.extend((0..m).map(|j| off[j] / innovation[j * m + j].sqrt()));
             if let Some(gain) = gain(&moments(&ends, &expected), &innovation, m) {
                 for i in 0..n {
                     let row = &gain[i * m..(i + 1) * m];
@@ -111,7 +113,7 @@ impl<M: Model> Ensemble<M> {
         self.draw_cloud(&filter, &clocks, h);
         self.unscented = Some(filter);
         if m > 0 {
-            report.informed = self.compare(&before);
+            self.compare(&before);
         }
         report
     }
@@ -187,9 +189,10 @@ impl<M: Model> Ensemble<M> {
         self.each(&Serial, |tools, batch| batch.start_from_end(tools, h));
     }
 
-    /// The noise that each sample is said to have.
-    pub(super) fn stated_noise(&self, observations: &[Observation]) -> Vec<f64> {
-        observations.iter().map(|o| self.settings.channels[o.channel].noise_sd_mmhg).collect()
+    /// The noise that each sample is said to have, into `out`.
+    pub(super) fn stated_noise(&self, observations: &[Observation], out: &mut Vec<f64>) {
+        out.clear();
+        out.extend(observations.iter().map(|o| self.settings.channels[o.channel].noise_sd_mmhg));
     }
 }
 

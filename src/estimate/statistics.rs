@@ -1,6 +1,6 @@
 //! Summaries of an ensemble.
 
-use super::random::Directions;
+use super::cloud::{Cloud, degrees};
 use crate::model::lanes::{InstructionSet, WIDTH};
 
 /// One quantity: where it is, and how uncertain by source.
@@ -69,17 +69,14 @@ pub fn summarise(values: &mut [f64], aleatoric_sd: f64, model_share: f64) -> Sum
 /// Variables over the members (their discrepancies) that may explain the spread of others.
 #[derive(Debug, Clone, Default)]
 pub struct Explainers {
-    members: usize,
-    directions: Directions,
+    variables: Cloud,
 }
 
 impl Explainers {
     /// From the rows of `variables`, each `[n_members]`.
     #[must_use]
     pub fn new(variables: &[f64], members: usize) -> Self {
-        let mut directions = Directions::new(members, InstructionSet::default());
-        variables.chunks_exact(members).for_each(|variable| directions.add(variable));
-        Self { members, directions }
+        Self { variables: Cloud::of(variables, members, InstructionSet::default()) }
     }
 
     /// The share of the variance of `values` `[n_members]` that a linear regression on these variables explains,
@@ -87,17 +84,18 @@ impl Explainers {
     #[must_use]
     #[allow(clippy::cast_precision_loss)]
     pub fn share_of(&self, values: &[f64]) -> f64 {
-        let count = self.directions.len();
-        if count == 0 || self.members < count + 2 {
+        let (count, members) = (self.variables.rank(), self.variables.members());
+        if count == 0 || members < count + 2 {
             return 0.0;
         }
         let centred = centred(values);
-        let explained: f64 = self.directions.along(&centred).map(|along| along * along).sum();
+        let along = |direction: &[f64]| dot(direction, &centred).powi(2) / degrees(members);
+        let explained: f64 = self.variables.directions().chunks_exact(members).map(along).sum();
         let total = norm(&centred).powi(2);
         if total <= 0.0 {
             return 0.0;
         }
-        let chance = (self.members as f64 - 1.0) / (self.members - 1 - count) as f64;
+        let chance = (members as f64 - 1.0) / (members - 1 - count) as f64;
         (1.0 - (1.0 - explained / total) * chance).clamp(0.0, 1.0)
     }
 }

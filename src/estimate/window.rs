@@ -139,6 +139,9 @@ pub struct WindowCutter {
     /// Event time of the last sample that entered a window.
     last_data: Option<EventTime>,
     ended: bool,
+    /// Vectors to be used again.
+    taken: Vec<(EventTime, Observation)>,
+    spare: Vec<Observation>,
 }
 
 impl WindowCutter {
@@ -161,6 +164,8 @@ impl WindowCutter {
             last_arrival: ArrivalTime(0),
             last_data: None,
             ended: false,
+            taken: Vec::new(),
+            spare: Vec::new(),
         }
     }
 
@@ -309,6 +314,11 @@ impl WindowCutter {
         Some(ClosedWindow { start, end, observations, gone_silent, closed_at })
     }
 
+    /// Takes back a window that is done with, so that the next one need not be allocated.
+    pub fn recycle(&mut self, window: ClosedWindow) {
+        self.spare = window.observations;
+    }
+
     /// Start of the first window: once every channel has spoken, or the first has waited long enough.
     fn origin(&self, now: ArrivalTime) -> Option<EventTime> {
         let waited = now.ns_since(self.first_arrival?) > self.settings.allowed_lateness_ns;
@@ -360,7 +370,8 @@ impl WindowCutter {
     #[allow(clippy::cast_precision_loss)]
     fn observations(&mut self, start: EventTime, end: EventTime, first: bool) -> Vec<Observation> {
         let length = self.settings.length_ns as f64;
-        let mut taken: Vec<(EventTime, Observation)> = Vec::new();
+        let taken = &mut self.taken;
+        taken.clear();
         for (i, channel) in self.channels.iter_mut().enumerate() {
             while let Some(sample) = channel.pending.front().copied().filter(|s| s.time <= end) {
                 channel.pending.pop_front();
@@ -370,8 +381,12 @@ impl WindowCutter {
                 }
             }
         }
-        taken.sort_by_key(|(time, o)| (*time, o.channel));
-        taken.into_iter().map(|(_, o)| o).collect()
+        // No two are alike: of a channel, the same time is refused.
+        taken.sort_unstable_by_key(|(time, o)| (*time, o.channel));
+        let mut observations = std::mem::take(&mut self.spare);
+        observations.clear();
+        observations.extend(taken.iter().map(|(_, o)| *o));
+        observations
     }
 
     /// Whether silence has lasted so long that a window with this end is not even forecast.

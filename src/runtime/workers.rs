@@ -50,7 +50,8 @@ impl Workers {
     /// Runs `job` in this pool with all other threads awake and waiting for parts of it: those of a window are so short
     /// that a thread that sleeps would come too late. Meant for one job that is to be done as fast as the machine goes.
     pub fn concentrate<T: Send>(&self, job: impl FnOnce() -> T + Send) -> T {
-        let (awake, over) = (AtomicUsize::new(0), AtomicBool::new(false));
+        let (awake, over) = (AtomicUsize::new(0), Alone(AtomicBool::new(false)));
+        let over = &over.0;
         let keep_awake = || {
             awake.fetch_add(1, Ordering::Relaxed);
             while !over.load(Ordering::Relaxed) {
@@ -61,7 +62,7 @@ impl Workers {
         };
         self.pool.install(|| {
             rayon::scope(|scope| {
-                let _end = OnDrop(&over);
+                let _end = OnDrop(over);
                 (1..self.threads()).for_each(|_| scope.spawn(|_| keep_awake()));
                 // They must not be left to this thread, which would then wait for itself.
                 while awake.load(Ordering::Relaxed) + 1 < self.threads() {
@@ -83,6 +84,10 @@ impl Workers {
     }
 }
 
+/// With no neighbour in its lines of the cache: who waits for it would slow down whoever works beside it.
+#[repr(align(128))]
+struct Alone<T>(T);
+
 /// Says so when it is over, also by a panic.
 struct OnDrop<'a>(&'a AtomicBool);
 
@@ -93,23 +98,34 @@ impl Drop for OnDrop<'_> {
 }
 
 /// In equal parts, one per thread: batches cost alike, and a window is too short to share it out piece by piece.
-fn split(batches: &mut [Batch], parts: usize, job: &(dyn Fn(&mut Batch) + Sync)) {
+/// What is to be done beside goes with the first part, which is the smaller one where they are not equal.
+fn split(batches: &mut [Batch], parts: usize, job: &(dyn Fn(&mut Batch) + Sync), beside: &mut (dyn FnMut() + Send)) {
     if parts < 2 || batches.len() < 2 {
         batches.iter_mut().for_each(job);
+        beside();
         return;
     }
     let (first, rest) = batches.split_at_mut(batches.len() / parts);
-    rayon::join(|| split(rest, parts - 1, job), || first.iter_mut().for_each(job));
+    let first_part = || {
+        first.iter_mut().for_each(job);
+        beside();
+    };
+    rayon::join(|| split(rest, parts - 1, job, &mut || {}), first_part);
 }
 
 impl Parallel for Workers {
-    fn for_each(&self, batches: &mut [Batch], job: &(dyn Fn(&mut Batch) + Sync)) {
+    fn for_each_beside(
+        &self,
+        batches: &mut [Batch],
+        job: &(dyn Fn(&mut Batch) + Sync),
+        beside: &mut (dyn FnMut() + Send),
+    ) {
         let threads = self.threads();
         if threads == 1 || self.pool.current_thread_index().is_some() {
-            split(batches, threads, job);
+            split(batches, threads, job, beside);
         } else {
             // From outside, the hand-over costs as much as a short window.
-            self.pool.install(|| split(batches, threads, job));
+            self.pool.install(|| split(batches, threads, job, beside));
         }
     }
 

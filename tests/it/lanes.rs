@@ -212,7 +212,8 @@ fn a_coupled_window_is_that_of_the_general_solver() {
                     },
                 )
                 .collect();
-            let covariance = square(&root, n_u);
+            let mut covariance = Vec::new();
+            square(&root, n_u, &mut covariance);
             let (mut solver, mut general) = (CollocationSolver::default(), Solution::default());
             let mut scratch = FitScratch::default();
             for step in 0..60 {

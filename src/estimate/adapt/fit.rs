@@ -137,9 +137,10 @@ impl ChannelFit {
     /// None before half a beat has been seen.
     #[allow(clippy::cast_precision_loss)]
     fn known_recurrence(&self) -> Option<f64> {
-        let square = |phase: &Phase| phase.sum * phase.sum / phase.square_weight;
-        let known: Vec<f64> = self.phases.iter().filter(|phase| phase.square_weight > 0.0).map(square).collect();
-        (known.len() >= PHASES / 2).then(|| known.iter().sum::<f64>() / known.len() as f64)
+        let known = || self.phases.iter().filter(|phase| phase.square_weight > 0.0);
+        let squares = known().map(|phase| phase.sum * phase.sum / phase.square_weight);
+        let count = known().count();
+        (count >= PHASES / 2).then(|| squares.sum::<f64>() / count as f64)
     }
 
     /// Whether the model does not fit: what it misses comes back with every beat, or is only covered by extra noise.
@@ -161,8 +162,8 @@ impl ChannelFit {
         }
         // The square of a mean is larger than that of what it estimates, by the variance of the mean.
         let square = |phase: &Phase| (phase.sum * phase.sum - phase.square_weight) / (phase.weight * phase.weight);
-        let known: Vec<f64> = self.phases.iter().filter(|phase| phase.weight > 0.0).map(square).collect();
-        let mean = known.iter().sum::<f64>() / known.len() as f64;
+        let known = || self.phases.iter().filter(|phase| phase.weight > 0.0);
+        let mean = known().map(square).sum::<f64>() / known().count() as f64;
         let here = phase.map(|phase| &self.phases[bin(phase)]).filter(|phase| phase.weight > 0.0).map_or(0.0, square);
         // The less it stands out, the more of it is chance that has been picked.
         let share = (recurrence - SYSTEMATIC) / (recurrence - 1.0);

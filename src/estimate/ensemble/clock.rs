@@ -4,6 +4,7 @@ use super::{Batch, Ensemble, Parallel};
 use crate::estimate::batch::{read, write};
 use crate::estimate::timing::{ClockEdit, WAITING_PHASE};
 use crate::model::Model;
+use crate::model::lanes::WIDTH;
 
 /// Longest time over which a clock that could not be corrected in time is set forth \[s\].
 const MAX_CLOCK_S: f64 = 2.0;
@@ -50,10 +51,13 @@ impl<M: Model> Ensemble<M> {
     /// Gives the states the spread that they started with: they have run by a wrong clock.
     fn spread_anew(&mut self) {
         let (n, m) = (self.model.n_states(), self.len());
-        let draws = self.draw(n, &self.rows());
-        for (s, row) in draws.chunks_exact(m).enumerate() {
+        let draws = self.draw(n);
+        for (s, draws) in draws.chunks_exact(m).enumerate() {
             let sd = self.settings.initial_state_sd[s];
-            self.add_to_state(s, sd, row);
+            for (batch, draws) in self.batches.iter_mut().zip(draws.chunks(WIDTH)) {
+                batch.x[s].0.iter_mut().zip(draws).for_each(|(x, e)| *x += sd * e);
+                batch.fill_up();
+            }
         }
     }
 
@@ -92,7 +96,7 @@ impl<M: Model> Ensemble<M> {
         self.clock_waits = false;
         let m = self.len();
         let known = !self.estimated.contains(&cycle.rate);
-        let draws = self.draw(2, &self.rows());
+        let draws = self.draw(2);
         if let Some(rate) = rate {
             let (low, high) = self.settings.beliefs[cycle.rate].bounds;
             let sd = if known { 0.0 } else { RATE_SD };

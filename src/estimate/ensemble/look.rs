@@ -1,28 +1,49 @@
 //! One window of X-TFC: what the members expect, how far off the samples are, what is learnt of that.
 
-use super::{Ensemble, Observation, Parallel, WindowReport};
-use crate::estimate::batch::{SharedPrior, expectations};
+use super::{Ensemble, Observation, Parallel, Walk, WindowReport};
+use crate::estimate::batch::{SharedPrior, read_expectations};
+use crate::estimate::cloud::Cloud;
 use crate::estimate::coupling::coupled;
 use crate::estimate::smoother::Correction;
-use crate::estimate::statistics::mean_and_sd;
 use crate::model::Model;
 
 /// Longest time between two steps of what wanders \[s\].
 const WANDER_S: f64 = 0.02;
 
+/// Reused from window to window.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Scratch {
+    pub walks: Vec<Walk>,
+    /// Members, `[n_u x n_members]`, and what they are together.
+    pub rows: Vec<f64>,
+    pub cloud: Cloud,
+    /// What they wander by, `[n_walks x n_members]`.
+    pub draws: Vec<f64>,
+    /// Of the samples, `[n_observations x n_members]`.
+    noise: Vec<f64>,
+    /// What members expect of them, `[n_observations x n_members]`, and what that is together.
+    expected: Vec<f64>,
+    expectations: Cloud,
+    judged: Judged,
+    /// Shared prior, `[n_u x n_u]`.
+    root: Vec<f64>,
+    covariance: Vec<f64>,
+    /// Of the samples, `[n_observations x n_observations]`.
+    precision: Vec<f64>,
+    factor: Vec<f64>,
+    /// Mean and sd of the estimated coordinates.
+    before: Vec<(f64, f64)>,
+}
+
 /// Samples of a window against what the members expect.
 #[derive(Debug, Clone, Default)]
 struct Judged {
-    /// Mean of what the members expect \[mmHg\].
-    expected: Vec<f64>,
     /// Noise that each is taken to have \[mmHg\].
     sd: Vec<f64>,
     /// Observed minus expected, in units of the stated noise.
     residuals: Vec<f64>,
     /// The sd that members and noise give it \[mmHg\].
     expected_sd: Vec<f64>,
-    /// Observed minus expected in that unit.
-    innovations: Vec<f64>,
 }
 
 impl<M: Model> Ensemble<M> {
@@ -47,43 +68,66 @@ impl<M: Model> Ensemble<M> {
             return self.forecast(parallel);
         }
         self.look_forward(observations, parallel);
-        let expected = expectations(&self.batches, observations.len());
-        let judged = self.judge(observations, &expected);
-        if !self.listening {
-            let report = self.go_on(parallel);
-            return WindowReport { innovations: judged.innovations, expected: judged.expected, ..report };
-        }
-        let (rows, m) = (self.rows(), self.len());
-        let noise = self.draw(observations.len(), &rows);
-        coupled::covariance_root(&rows, m, &mut self.root);
+        let mut scratch = std::mem::take(&mut self.scratch);
+        self.judge(observations, &mut scratch);
+        let report = if self.listening {
+            let report = self.take_in(observations, h, &mut scratch, parallel);
+            self.tell_the_fits(observations, h, &scratch.judged);
+            report
+        } else {
+            self.go_on(parallel)
+        };
+        self.scratch = scratch;
+        report
+    }
+
+    /// The update of the members by the samples of a window.
+    fn take_in(
+        &mut self,
+        observations: &[Observation],
+        h: f64,
+        scratch: &mut Scratch,
+        parallel: &dyn Parallel,
+    ) -> WindowReport {
+        let Scratch { rows, cloud, noise, expected, expectations, judged, root, .. } = scratch;
+        self.read_rows(rows);
+        cloud.set(rows, self.len(), self.settings.instructions);
+        self.normals.draw(observations.len(), self.len(), Some(cloud), noise);
+        root.clear();
+        root.extend_from_slice(cloud.root());
         let inflation = self.settings.drift.inflation.powf(h);
         if inflation > 1.0 {
-            self.root.iter_mut().for_each(|r| *r *= inflation.sqrt());
+            root.iter_mut().for_each(|r| *r *= inflation.sqrt());
         }
         if self.held {
-            self.fix_parameters();
+            self.fix_parameters(root);
         }
         if self.settings.live.smoothing_lag_ns > 0 {
-            self.correct_the_past(observations, &expected, &judged.sd, &noise);
+            self.correct_the_past(observations, expected, &judged.sd, noise);
         }
-        let root = std::mem::take(&mut self.root);
-        let covariance = coupled::square(&root, rows.len() / m);
-        let precision = coupled::precision(&coupled::covariance(&expected, &expected, m), &judged.sd);
-        let prior = SharedPrior { root: &root, covariance: &covariance, precision: &precision };
-        let before: Vec<_> = rows.chunks_exact(m).skip(self.model.n_states()).map(mean_and_sd).collect();
-        let report = self.learn(observations, (&judged.sd, &noise), (Some(prior), &before), parallel);
-        self.root = root;
+        coupled::square(root, cloud.len(), &mut scratch.covariance);
+        coupled::precision(expectations.root(), &judged.sd, &mut scratch.factor, &mut scratch.precision);
+        scratch.before.clear();
+        scratch.before.extend((self.model.n_states()..cloud.len()).map(|row| (cloud.mean()[row], cloud.sd(row))));
+        let prior = SharedPrior { root, covariance: &scratch.covariance, precision: &scratch.precision };
+        self.learn(observations, (&judged.sd, noise), (Some(prior), &scratch.before), parallel)
+    }
+
+    /// After a window, what was off in it.
+    fn tell_the_fits(&mut self, observations: &[Observation], h: f64, judged: &Judged) {
+        if self.held {
+            return;
+        }
         // Clocks stand at the end of the window by now.
         let clock = self.model.cycle().zip(self.cycles());
-        for (j, o) in observations.iter().enumerate().filter(|_| !self.held) {
+        for (j, o) in observations.iter().enumerate() {
             let phase = clock.map(|(cycle, cycles)| {
                 let rate = self.batches[0].theta[cycle.rate].0[0] / 60.0;
                 (cycles - (1.0 - o.s) * h * rate).rem_euclid(1.0)
             });
-            let (residual, innovation) = (judged.residuals[j], judged.innovations[j]);
+            let (residual, innovation) = (judged.residuals[j], self.findings.innovations[j]);
             self.fits[o.channel].hear(self.elapsed_s + o.s * h, phase, residual, judged.expected_sd[j], innovation);
         }
-        WindowReport { innovations: judged.innovations, expected: judged.expected, ..report }
     }
 
     /// One window of `independent`: every member for itself.
@@ -92,21 +136,24 @@ impl<M: Model> Ensemble<M> {
             return self.forecast(parallel);
         }
         self.look_forward(observations, parallel);
-        let expected = expectations(&self.batches, observations.len());
-        let judged = self.judge(observations, &expected);
-        let sd = self.stated_noise(observations);
-        let noise = self.draw(observations.len(), &[]);
-        let before = self.coordinates();
-        let report = self.learn(observations, (&sd, &noise), (None, &before), parallel);
-        WindowReport { innovations: judged.innovations, expected: judged.expected, ..report }
+        let mut scratch = std::mem::take(&mut self.scratch);
+        self.judge(observations, &mut scratch);
+        let Scratch { noise, judged, before, .. } = &mut scratch;
+        self.stated_noise(observations, &mut judged.sd);
+        self.normals.draw(observations.len(), self.len(), None, noise);
+        before.clear();
+        before.extend((0..self.estimated.len()).map(|k| self.coordinate(k)));
+        let report = self.learn(observations, (&judged.sd, noise), (None, before), parallel);
+        self.scratch = scratch;
+        report
     }
 
     /// Takes the parameters out of what a window can move, but for the phase of the clock.
-    fn fix_parameters(&mut self) {
+    fn fix_parameters(&self, root: &mut [f64]) {
         let (n, n_u) = (self.model.n_states(), self.unknowns.len(self.model.n_states()));
         let phase = self.model.cycle().map(|cycle| cycle.phase);
         for (k, _) in self.estimated.iter().enumerate().filter(|(_, p)| Some(**p) != phase) {
-            self.root[(n + k) * n_u..(n + k + 1) * n_u].fill(0.0);
+            root[(n + k) * n_u..(n + k + 1) * n_u].fill(0.0);
         }
     }
 
@@ -125,10 +172,15 @@ impl<M: Model> Ensemble<M> {
     }
 
     /// What the members expect of the samples, and how far off each sample is.
-    fn judge(&self, observations: &[Observation], expected: &[f64]) -> Judged {
-        let mut judged = Judged::default();
-        for (o, expected) in observations.iter().zip(expected.chunks_exact(self.len())) {
-            let (mean, spread) = mean_and_sd(expected);
+    fn judge(&mut self, observations: &[Observation], scratch: &mut Scratch) {
+        let Scratch { expected, expectations, judged, .. } = scratch;
+        read_expectations(&self.batches, observations.len(), expected);
+        expectations.set(expected, self.len(), self.settings.instructions);
+        judged.sd.clear();
+        judged.residuals.clear();
+        judged.expected_sd.clear();
+        for (j, o) in observations.iter().enumerate() {
+            let (mean, spread) = (expectations.mean()[j], expectations.sd(j));
             let stated = self.settings.channels[o.channel].noise_sd_mmhg;
             let noise = stated * self.fits[o.channel].noise_factor();
             let expected_sd = (spread * spread + noise * noise).sqrt();
@@ -137,10 +189,9 @@ impl<M: Model> Ensemble<M> {
             let far = innovation.abs() / self.settings.adaptation.outlier_sd;
             judged.sd.push(if far > 1.0 { noise * far.sqrt() } else { noise });
             judged.residuals.push((o.value - mean) / stated);
-            judged.expected.push(mean);
             judged.expected_sd.push(expected_sd);
-            judged.innovations.push(innovation);
+            self.findings.expected.push(mean);
+            self.findings.innovations.push(innovation);
         }
-        judged
     }
 }

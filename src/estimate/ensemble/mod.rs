@@ -4,6 +4,7 @@ mod beats;
 mod clock;
 mod look;
 mod review;
+mod rows;
 mod setup;
 mod size;
 mod summary;
@@ -13,6 +14,7 @@ use rand_chacha::ChaCha8Rng;
 
 use self::beats::Beats;
 use self::clock::Edit;
+use self::look::Scratch;
 use self::review::Memory;
 pub use self::setup::with_companions;
 use self::setup::{channel_fit, check, draw_bases, varying};
@@ -20,13 +22,12 @@ pub use self::summary::{ParameterSummary, Snapshot};
 use super::adapt::fit::ChannelFit;
 use super::adapt::pace::{Pace, diffusion};
 pub use super::batch::Batch;
-use super::batch::{Lesson, SharedPrior, Tools, gather, read};
+use super::batch::{Lesson, SharedPrior, read};
 use super::coupling::{coupled_unknowns, independent_unknowns};
-use super::random::exact_normals;
+use super::random::Normals;
 use super::rivals::Unscented;
 use super::settings::{CouplingKind, EstimatorSettings, SettingsError};
 use super::smoother::Smoother;
-use super::statistics::mean_and_sd;
 use crate::model::lanes::{Lanes, WIDTH};
 use crate::model::{Model, Transform};
 use crate::xtfc::problem::Unknowns;
@@ -38,7 +39,17 @@ const INFORMED: f64 = 1e-4;
 /// see each other, so the order does not matter.
 pub trait Parallel: Sync {
     /// Calls `job(batch)` for every batch.
-    fn for_each(&self, batches: &mut [Batch], job: &(dyn Fn(&mut Batch) + Sync));
+    fn for_each(&self, batches: &mut [Batch], job: &(dyn Fn(&mut Batch) + Sync)) {
+        self.for_each_beside(batches, job, &mut || {});
+    }
+
+    /// The same, and `beside` once.
+    fn for_each_beside(
+        &self,
+        batches: &mut [Batch],
+        job: &(dyn Fn(&mut Batch) + Sync),
+        beside: &mut (dyn FnMut() + Send),
+    );
 
     /// Calls `job(index)` for every index below `count`.
     fn for_indices(&self, count: usize, job: &(dyn Fn(usize) + Sync));
@@ -49,8 +60,14 @@ pub trait Parallel: Sync {
 pub struct Serial;
 
 impl Parallel for Serial {
-    fn for_each(&self, batches: &mut [Batch], job: &(dyn Fn(&mut Batch) + Sync)) {
+    fn for_each_beside(
+        &self,
+        batches: &mut [Batch],
+        job: &(dyn Fn(&mut Batch) + Sync),
+        beside: &mut (dyn FnMut() + Send),
+    ) {
         batches.iter_mut().for_each(job);
+        beside();
     }
 
     fn for_indices(&self, count: usize, job: &(dyn Fn(usize) + Sync)) {
@@ -70,7 +87,7 @@ pub struct Observation {
 }
 
 /// How a window went, over all members.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct WindowReport {
     /// Members whose solve gave numbers.
     pub solved: usize,
@@ -86,14 +103,38 @@ pub struct WindowReport {
     pub iterations: usize,
     /// Root mean square over members of the physics residual \[mmHg/s\].
     pub physics_rms: f64,
+}
+
+/// What a window said about samples and parameters.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Findings {
     /// Normalised innovation of each observation: (observed - forecast) over the sd that members and noise give it.
     pub innovations: Vec<f64>,
     /// What the members expected of each observation, on average \[mmHg\].
     pub expected: Vec<f64>,
     /// Estimated parameters, by their position among them, that have begun to move.
     pub moving: Vec<usize>,
-    /// Whether the window had data that said something about each estimated parameter.
+    /// Whether the window had data that said something about each estimated parameter; empty without data.
     pub informed: Vec<bool>,
+}
+
+impl Findings {
+    fn clear(&mut self) {
+        self.innovations.clear();
+        self.expected.clear();
+        self.moving.clear();
+        self.informed.clear();
+    }
+}
+
+/// How a row of the members wanders: it is pulled to a centre, and spreads.
+#[derive(Debug, Clone, Copy)]
+struct Walk {
+    row: usize,
+    centre: f64,
+    /// Share of the distance from the centre that is left.
+    keep: f64,
+    sd: f64,
 }
 
 /// The ensemble of one bed.
@@ -112,9 +153,9 @@ pub struct Ensemble<M: Model> {
     resting: Vec<Batch>,
     /// Equations for eight members at once; None where members are solved one by one.
     lanes: Option<M::Lanes>,
-    pub(super) rng: ChaCha8Rng,
-    /// Shared prior root (`coupled`), `[n_u x n_u]`.
-    root: Vec<f64>,
+    pub(super) normals: Normals,
+    pub(super) findings: Findings,
+    scratch: Scratch,
     /// Coordinate that each estimated parameter is pulled back to.
     pub(super) centre: Vec<f64>,
     /// Spread of each estimated coordinate at the start.
@@ -161,7 +202,8 @@ impl<M: Model> Ensemble<M> {
         let theta = settings.theta.clone();
         let (n, m) = (model.n_states(), settings.members);
         let bases = draw_bases(&model, &settings, &mut rng, parallel)?;
-        let draws = exact_normals(n + estimated.len(), m, &[], &mut rng, settings.instructions);
+        let (mut normals, mut draws) = (Normals::new(rng, settings.instructions), Vec::new());
+        normals.draw(n + estimated.len(), m, None, &mut draws);
         let (states, guesses) = draws.split_at(n * m);
         let centre: Vec<f64> = estimated.iter().zip(&transforms).map(|(&p, t)| t.forward(theta[p])).collect();
         let state = |i: usize| {
@@ -202,8 +244,9 @@ impl<M: Model> Ensemble<M> {
             estimated,
             transforms,
             unknowns,
-            rng,
-            root: Vec::new(),
+            normals,
+            findings: Findings::default(),
+            scratch: Scratch::default(),
             centre,
             initial_sd: Vec::new(),
             elapsed_s: 0.0,
@@ -223,8 +266,7 @@ impl<M: Model> Ensemble<M> {
         };
         ensemble.initial_sd = (0..ensemble.estimated.len()).map(|k| ensemble.coordinate(k).1).collect();
         if ensemble.settings.coupling == CouplingKind::Ukf {
-            ensemble.unscented =
-                Some(Unscented::new(&ensemble.rows(), m, &mut ensemble.rng, ensemble.settings.instructions));
+            ensemble.unscented = Some(Unscented::new(&ensemble.cloud(), &mut ensemble.normals));
         }
         Ok(ensemble)
     }
@@ -275,9 +317,15 @@ impl<M: Model> Ensemble<M> {
         &self.fits[channel]
     }
 
+    /// What the last window said.
+    pub fn findings(&self) -> &Findings {
+        &self.findings
+    }
+
     /// Solves one window for every member; observations are in order of time, then channel.
     pub fn step(&mut self, observations: &[Observation], parallel: &dyn Parallel) -> WindowReport {
         let h = self.settings.window.length_s();
+        self.findings.clear();
         let report = match self.settings.coupling {
             CouplingKind::Coupled => self.coupled_step(observations, h, parallel),
             CouplingKind::Independent => self.independent_step(observations, parallel),
@@ -307,17 +355,18 @@ impl<M: Model> Ensemble<M> {
         self.listening = listening;
     }
 
-    /// Whether the window said something about each estimated parameter; tells the paces what it said.
-    pub(super) fn compare(&mut self, before: &[(f64, f64)]) -> Vec<bool> {
-        let after = self.coordinates();
-        let pairs = before.iter().zip(&after);
+    /// Finds out whether the window said something about each estimated parameter, whose coordinates were `before`; tells
+    /// the paces what it said.
+    pub(super) fn compare(&mut self, before: &[(f64, f64)]) {
         // What is looked at again was heard before.
-        let listening =
-            if self.held || (self.second_look.is_some() && !self.hears_again) { 0 } else { self.paces.len() };
-        for (pace, ((mean, sd), (new_mean, new_sd))) in self.paces.iter_mut().take(listening).zip(pairs.clone()) {
-            pace.hear((*mean, *new_mean), (sd * sd, new_sd * new_sd));
+        let listening = !(self.held || (self.second_look.is_some() && !self.hears_again));
+        for (k, (mean, sd)) in before.iter().enumerate() {
+            let (new_mean, new_sd) = self.coordinate(k);
+            if listening {
+                self.paces[k].hear((*mean, new_mean), (sd * sd, new_sd * new_sd));
+            }
+            self.findings.informed.push(new_sd * new_sd < (1.0 - INFORMED) * sd * sd);
         }
-        pairs.map(|((_, sd), (_, new))| new * new < (1.0 - INFORMED) * sd * sd).collect()
     }
 
     /// Random walk of the parameters, with a pull to where they started, and process noise of the states, for the time
@@ -328,117 +377,47 @@ impl<M: Model> Ensemble<M> {
     }
 
     pub(super) fn wander_for(&mut self, dt: f64) {
-        let drift = &self.settings.drift;
-        let excess: Vec<f64> = self.fits.iter().map(ChannelFit::excess).collect();
-        let largest = excess.iter().copied().fold(1.0, f64::max);
-        let own = |state: usize| self.settings.channels.iter().position(|c| c.state == state);
-        let states: Vec<(usize, f64)> = drift
-            .states
-            .iter()
-            .enumerate()
-            .map(|(s, sd)| {
-                // A model that misses something in one place is off, if less so, in others as well: a sensor says how
-                // far. What no sensor shows is not made worse on that account.
-                let extra = own(s).map_or(*sd, |c| sd * excess[c].max(largest.sqrt()));
-                (s, extra * dt.sqrt())
-            })
-            .filter(|(_, sd)| *sd > 0.0)
-            .collect();
-        let adaptive = self.settings.adaptation.pace && self.settings.coupling == CouplingKind::Coupled;
-        let parameters: Vec<(usize, f64, f64)> = self
-            .estimated
-            .iter()
-            .enumerate()
-            .map(|(k, &p)| {
-                let belief = &self.settings.beliefs[p];
-                let learnt = adaptive && self.learns_pace(k);
-                let pace = if learnt { self.paces[k].now() } else { belief.drift };
-                (k, (-belief.reversion * dt).exp(), pace * diffusion(belief.reversion, dt).sqrt())
-            })
-            .filter(|(_, keep, sd)| *sd > 0.0 || *keep < 1.0)
-            .collect();
+        let mut scratch = std::mem::take(&mut self.scratch);
+        let Scratch { walks, rows, cloud, draws, .. } = &mut scratch;
+        self.plan_walks(dt, walks);
+        self.read_rows(rows);
         let m = self.len();
-        let draws = self.draw(states.len() + parameters.len(), &self.rows());
-        for (row, &(state, sd)) in draws.chunks_exact(m).zip(&states) {
-            self.add_to_state(state, sd, row);
+        cloud.set(rows, m, self.settings.instructions);
+        self.normals.draw(walks.len(), m, Some(cloud), draws);
+        for (walk, draws) in walks.iter().zip(draws.chunks_exact(m)) {
+            let row = &mut rows[walk.row * m..][..m];
+            for (value, e) in row.iter_mut().zip(draws) {
+                *value = walk.centre + walk.keep * (*value - walk.centre) + walk.sd * e;
+            }
+            self.place_row(0, walk.row, row);
         }
-        for (row, &(k, keep, sd)) in draws.chunks_exact(m).skip(states.len()).zip(&parameters) {
-            let (p, transform, centre) = (self.estimated[k], self.transforms[k], self.centre[k]);
+        self.scratch = scratch;
+    }
+
+    /// What wanders, and how far in `dt`.
+    fn plan_walks(&self, dt: f64, walks: &mut Vec<Walk>) {
+        walks.clear();
+        let largest = self.fits.iter().map(ChannelFit::excess).fold(1.0, f64::max);
+        for (row, sd) in self.settings.drift.states.iter().enumerate() {
+            // A model that misses something in one place is off, if less so, in others as well: a sensor says how
+            // far. What no sensor shows is not made worse on that account.
+            let own = self.settings.channels.iter().position(|c| c.state == row);
+            let extra = own.map_or(1.0, |c| self.fits[c].excess().max(largest.sqrt()));
+            walks.push(Walk { row, centre: 0.0, keep: 1.0, sd: sd * extra * dt.sqrt() });
+        }
+        let adaptive = self.settings.adaptation.pace && self.settings.coupling == CouplingKind::Coupled;
+        for (k, &p) in self.estimated.iter().enumerate() {
             let belief = &self.settings.beliefs[p];
-            for batch in &mut self.batches {
-                let draws = &row[batch.first()..][..batch.len()];
-                let u = coordinates(batch.theta[p], transform);
-                for (lane, e) in draws.iter().enumerate() {
-                    let u = centre + keep * (u.0[lane] - centre) + sd * e;
-                    batch.theta[p].0[lane] = belief.value(transform, u);
-                }
-                batch.fill_up();
-            }
+            let learnt = adaptive && self.learns_pace(k);
+            let pace = if learnt { self.paces[k].now() } else { belief.drift };
+            walks.push(Walk {
+                row: self.model.n_states() + k,
+                centre: self.centre[k],
+                keep: (-belief.reversion * dt).exp(),
+                sd: pace * diffusion(belief.reversion, dt).sqrt(),
+            });
         }
-    }
-
-    /// Sets states and parameter coordinates of the batches from `first` on, `[n_u x their members]`.
-    pub(super) fn place_from(&mut self, first: usize, rows: &[f64]) {
-        let Self { batches, estimated, transforms, settings, model, .. } = self;
-        let (n, batches) = (model.n_states(), &mut batches[first..]);
-        let offset = batches.first().map_or(0, Batch::first);
-        let members: usize = batches.iter().map(Batch::len).sum();
-        for batch in batches {
-            let (at, count) = (batch.first() - offset, batch.len());
-            let own = |row: usize| &rows[row * members + at..][..count];
-            for s in 0..n {
-                batch.x[s].0[..count].copy_from_slice(own(s));
-            }
-            for (k, &p) in estimated.iter().enumerate() {
-                for (value, u) in batch.theta[p].0.iter_mut().zip(own(n + k)) {
-                    *value = settings.beliefs[p].value(transforms[k], *u);
-                }
-            }
-            batch.fill_up();
-        }
-    }
-
-    /// Standard normals over the members, see `random`.
-    pub(super) fn draw(&mut self, rows: usize, against: &[f64]) -> Vec<f64> {
-        let members = self.len();
-        exact_normals(rows, members, against, &mut self.rng, self.settings.instructions)
-    }
-
-    /// Adds `sd` times the draws of the members to a state.
-    fn add_to_state(&mut self, state: usize, sd: f64, draws: &[f64]) {
-        for batch in &mut self.batches {
-            let draws = &draws[batch.first()..][..batch.len()];
-            batch.x[state].0.iter_mut().zip(draws).for_each(|(x, e)| *x += sd * e);
-            batch.fill_up();
-        }
-    }
-
-    /// States and parameter coordinates of the members now, `[n_u x n_members]`.
-    pub(super) fn rows(&self) -> Vec<f64> {
-        self.rows_of(&self.batches)
-    }
-
-    pub(super) fn rows_of(&self, batches: &[Batch]) -> Vec<f64> {
-        let mut rows = Vec::with_capacity((self.model.n_states() + self.estimated.len()) * batches.len() * WIDTH);
-        for state in 0..self.model.n_states() {
-            gather(batches, &mut rows, |batch| batch.x[state]);
-        }
-        for (&p, transform) in self.estimated.iter().zip(&self.transforms) {
-            gather(batches, &mut rows, |batch| coordinates(batch.theta[p], *transform));
-        }
-        rows
-    }
-
-    /// Mean and standard deviation of every estimated coordinate.
-    pub(super) fn coordinates(&self) -> Vec<(f64, f64)> {
-        (0..self.estimated.len()).map(|k| self.coordinate(k)).collect()
-    }
-
-    /// One batch after the other or side by side.
-    pub(super) fn each(&mut self, parallel: &dyn Parallel, job: impl Fn(&Tools<'_, M>, &mut Batch) + Sync) {
-        let Self { model, lanes, settings, unknowns, estimated, varying, batches, .. } = self;
-        let tools = Tools { model, lanes: lanes.as_ref(), settings, unknowns, estimated, varying };
-        parallel.for_each(batches, &|batch| job(&tools, batch));
+        walks.retain(|walk| walk.sd > 0.0 || walk.keep < 1.0);
     }
 
     /// Every member through the window as if there were no samples, and what that says of them.
@@ -476,12 +455,12 @@ impl<M: Model> Ensemble<M> {
     ) -> WindowReport {
         let h = self.clock_step_s();
         let lesson = Lesson { observations, sd, noise, members: self.len(), shared };
-        self.each(parallel, |tools, batch| {
+        self.each_and_draw_ahead(parallel, |tools, batch| {
             batch.fit(tools, &lesson);
             batch.move_on(tools, h);
         });
-        let mut report = self.account();
-        report.informed = self.compare(before);
+        let report = self.account();
+        self.compare(before);
         report
     }
 
@@ -527,26 +506,10 @@ impl<M: Model> Ensemble<M> {
         failed.len()
     }
 
-    /// Mean and standard deviation over the members of an estimated coordinate.
-    fn coordinate(&self, k: usize) -> (f64, f64) {
-        let mut values = Vec::with_capacity(self.len());
-        let (p, transform) = (self.estimated[k], self.transforms[k]);
-        gather(&self.batches, &mut values, |batch| coordinates(batch.theta[p], transform));
-        mean_and_sd(&values)
-    }
-
     /// All parameters of a member at the end of the last window.
     pub fn theta_of(&self, member: usize) -> Vec<f64> {
         let mut theta = Vec::new();
         read(&self.batches[member / WIDTH].theta, member % WIDTH, &mut theta);
         theta
-    }
-}
-
-/// The coordinates of parameters.
-fn coordinates(theta: Lanes, transform: Transform) -> Lanes {
-    match transform {
-        Transform::Log => theta.ln(),
-        Transform::Linear { scale } => theta / Lanes::splat(scale),
     }
 }

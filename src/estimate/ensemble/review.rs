@@ -23,10 +23,10 @@ pub(super) const REMEMBERED_S: f64 = 0.9;
 const LOOK_BACK_S: f64 = 0.4;
 
 /// The ensemble as it was.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct Checkpoint {
-    /// States and parameters, batch by batch.
-    members: Vec<(Vec<Lanes>, Vec<Lanes>)>,
+    /// Batch by batch, states and what varies of the parameters.
+    members: Vec<Lanes>,
     fits: Vec<ChannelFit>,
     paces: Vec<Pace>,
     wander_due_s: f64,
@@ -36,22 +36,43 @@ pub(super) struct Checkpoint {
     beat: Option<(BeatFollower, EventTime)>,
 }
 
+/// The samples of some windows.
+#[derive(Debug, Clone, Default)]
+struct Windows {
+    observations: Vec<Observation>,
+    /// Where each window ends.
+    ends: Vec<usize>,
+}
+
+impl Windows {
+    fn push(&mut self, observations: &[Observation]) {
+        self.observations.extend_from_slice(observations);
+        self.ends.push(self.observations.len());
+    }
+
+    fn clear(&mut self) {
+        self.observations.clear();
+        self.ends.clear();
+    }
+
+    fn iter(&self) -> impl Iterator<Item = &[Observation]> {
+        let starts = std::iter::once(0).chain(self.ends.iter().copied());
+        starts.zip(&self.ends).map(|(start, end)| &self.observations[start..*end])
+    }
+}
+
 /// The last moments, to be looked at again.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Memory {
     /// Each with the windows since the one before it.
-    checkpoints: VecDeque<(Checkpoint, Vec<Vec<Observation>>)>,
-    since: Vec<Vec<Observation>>,
+    checkpoints: VecDeque<(Checkpoint, Windows)>,
+    since: Windows,
 }
 
 impl Memory {
-    fn note(&mut self, observations: &[Observation]) {
-        self.since.push(observations.to_vec());
-    }
-
     #[allow(clippy::cast_precision_loss)]
     fn is_due(&self, h: f64) -> bool {
-        self.checkpoints.is_empty() || self.since.len() as f64 * h >= CHECKPOINT_S - 1e-9
+        self.checkpoints.is_empty() || self.since.ends.len() as f64 * h >= CHECKPOINT_S - 1e-9
     }
 
     /// Nothing is remembered.
@@ -60,20 +81,28 @@ impl Memory {
         self.since.clear();
     }
 
-    fn keep(&mut self, checkpoint: Checkpoint) {
-        self.checkpoints.push_back((checkpoint, std::mem::take(&mut self.since)));
-        if self.checkpoints.len() > CHECKPOINTS {
-            self.checkpoints.pop_front();
-        }
+    /// A place for a new checkpoint: that of the oldest, if there are enough.
+    fn place(&mut self) -> &mut Checkpoint {
+        let oldest = if self.checkpoints.len() < CHECKPOINTS { None } else { self.checkpoints.pop_front() };
+        let (checkpoint, mut windows) = oldest.unwrap_or_default();
+        std::mem::swap(&mut windows, &mut self.since);
+        self.since.clear();
+        self.checkpoints.push_back((checkpoint, windows));
+        let last = self.checkpoints.len() - 1;
+        &mut self.checkpoints[last].0
     }
 
     /// The last checkpoint before `from_s`, or the oldest, and all windows since, which are forgotten.
-    fn rewind(&mut self, from_s: f64) -> Option<(Checkpoint, Vec<Vec<Observation>>)> {
+    fn rewind(&mut self, from_s: f64) -> Option<(Checkpoint, Windows)> {
         let before = self.checkpoints.iter().rposition(|(checkpoint, _)| checkpoint.elapsed_s <= from_s).unwrap_or(0);
         let (checkpoint, _) = self.checkpoints.get(before)?.clone();
-        let mut windows: Vec<_> = self.checkpoints.drain(before + 1..).flat_map(|(_, windows)| windows).collect();
-        windows.append(&mut self.since);
-        Some((checkpoint, windows))
+        let mut all = Windows::default();
+        for (_, windows) in self.checkpoints.drain(before + 1..) {
+            windows.iter().for_each(|window| all.push(window));
+        }
+        self.since.iter().for_each(|window| all.push(window));
+        self.since.clear();
+        Some((checkpoint, all))
     }
 }
 
@@ -85,15 +114,14 @@ impl<M: Model> Ensemble<M> {
         h: f64,
         parallel: &dyn Parallel,
     ) -> WindowReport {
-        let mut report = self.look(observations, h, parallel);
+        let report = self.look(observations, h, parallel);
         if self.settings.adaptation.pace && self.listening {
-            let learnt: Vec<bool> = (0..self.estimated.len()).map(|k| self.learns_pace(k)).collect();
-            for (k, pace) in self.paces.iter_mut().enumerate() {
-                if pace.advance(h) && learnt[k] {
-                    report.moving.push(k);
+            for k in 0..self.paces.len() {
+                if self.paces[k].advance(h) && self.learns_pace(k) {
+                    self.findings.moving.push(k);
                 }
             }
-            if !report.moving.is_empty() {
+            if !self.findings.moving.is_empty() {
                 self.look_again(self.elapsed_s - LOOK_BACK_S, false, parallel);
             }
         }
@@ -106,9 +134,11 @@ impl<M: Model> Ensemble<M> {
         self.end_window(h);
         // Nothing else is ever looked at again.
         if self.settings.adaptation.pace || self.settings.live.timing != TimingSource::Clock {
-            self.memory.note(observations);
+            self.memory.since.push(observations);
             if self.memory.is_due(h) {
-                self.memory.keep(self.checkpoint());
+                let mut memory = std::mem::take(&mut self.memory);
+                self.keep(memory.place());
+                self.memory = memory;
             }
         }
         report
@@ -128,7 +158,9 @@ impl<M: Model> Ensemble<M> {
         }
         self.second_look = Some(self.window);
         self.hears_again = doubt;
-        for window in &windows {
+        let findings = std::mem::take(&mut self.findings);
+        for window in windows.iter() {
+            self.findings.clear();
             self.look(window, h, parallel);
             if doubt && self.settings.adaptation.pace && self.listening {
                 self.paces.iter_mut().for_each(|pace| _ = pace.advance(h));
@@ -141,27 +173,39 @@ impl<M: Model> Ensemble<M> {
         if let Some(before) = before {
             self.memory = before;
         }
+        self.findings = findings;
         self.second_look = None;
         self.hears_again = false;
     }
 
-    fn checkpoint(&self) -> Checkpoint {
-        Checkpoint {
-            members: self.batches.iter().map(|batch| (batch.x.clone(), batch.theta.clone())).collect(),
-            fits: self.fits.clone(),
-            paces: self.paces.clone(),
-            wander_due_s: self.wander_due_s,
-            elapsed_s: self.elapsed_s,
-            window: self.window,
-            clock_waits: self.clock_waits,
-            beat: self.beats.as_ref().map(|beats| (beats.follower.clone(), beats.end)),
+    /// Makes a checkpoint of how things are.
+    fn keep(&self, checkpoint: &mut Checkpoint) {
+        checkpoint.members.clear();
+        for batch in &self.batches {
+            checkpoint.members.extend_from_slice(&batch.x);
+            checkpoint.members.extend(self.varying.iter().map(|p| batch.theta[*p]));
+        }
+        checkpoint.fits.clone_from(&self.fits);
+        checkpoint.paces.clone_from(&self.paces);
+        checkpoint.wander_due_s = self.wander_due_s;
+        checkpoint.elapsed_s = self.elapsed_s;
+        checkpoint.window = self.window;
+        checkpoint.clock_waits = self.clock_waits;
+        match (&mut checkpoint.beat, &self.beats) {
+            (Some((follower, end)), Some(beats)) => {
+                follower.clone_from(&beats.follower);
+                *end = beats.end;
+            }
+            (beat, beats) => *beat = beats.as_ref().map(|beats| (beats.follower.clone(), beats.end)),
         }
     }
 
     fn restore(&mut self, checkpoint: &Checkpoint) {
-        for (batch, (x, theta)) in self.batches.iter_mut().zip(&checkpoint.members) {
-            batch.x.clone_from(x);
-            batch.theta.clone_from(theta);
+        let size = self.model.n_states() + self.varying.len();
+        for (batch, members) in self.batches.iter_mut().zip(checkpoint.members.chunks_exact(size)) {
+            let (x, theta) = members.split_at(batch.x.len());
+            batch.x.copy_from_slice(x);
+            self.varying.iter().zip(theta).for_each(|(p, value)| batch.theta[*p] = *value);
         }
         self.fits.clone_from(&checkpoint.fits);
         self.wander_due_s = checkpoint.wander_due_s;

@@ -5,11 +5,9 @@
 //! make of it by then.
 
 use super::Ensemble;
-use crate::estimate::coupling::coupled::covariance_root;
-use crate::estimate::random::exact_normals;
+use crate::estimate::cloud::Cloud;
 use crate::estimate::settings::CouplingKind;
 use crate::estimate::smoother::Smoother;
-use crate::estimate::statistics::{centred, mean_and_sd};
 use crate::model::Model;
 use crate::model::lanes::{Lanes, WIDTH};
 
@@ -50,21 +48,19 @@ impl<M: Model> Ensemble<M> {
     }
 
     fn rest(&mut self, batches: usize) {
-        let moments = Moments::of(&self.rows(), self.len());
+        let before = self.cloud();
         // The last rest first, so that they come back in their order.
         let mut resting = self.batches.split_off(batches);
         resting.append(&mut self.resting);
         self.resting = resting;
         if self.settings.coupling.is_bayesian() {
-            let (rows, m) = (self.rows(), self.len());
-            let own = Moments::of(&rows, m);
-            let centred: Vec<f64> = rows.chunks_exact(m).flat_map(centred).collect();
-            self.place_all(&moments.spread(&own.whitened(centred, m), m), 0);
+            let now = self.cloud();
+            self.place_all(&spread(&before, now.directions(), now.members()), 0);
         }
     }
 
     fn wake(&mut self, batches: usize) {
-        let moments = Moments::of(&self.rows(), self.len());
+        let moments = self.cloud();
         let common = self.theta_of(0);
         let first = self.batches.len();
         let back: Vec<_> = self.resting.drain(..batches - first).collect();
@@ -74,8 +70,9 @@ impl<M: Model> Ensemble<M> {
             self.batches.push(batch);
         }
         let m: usize = self.batches[first..].iter().map(super::Batch::len).sum();
-        let draws = exact_normals(moments.mean.len(), m, &[], &mut self.rng, self.settings.instructions);
-        self.place_all(&moments.spread(&draws, m), first);
+        let mut draws = Vec::new();
+        self.normals.draw(moments.len(), m, None, &mut draws);
+        self.place_all(&spread(&moments, &draws, m), first);
     }
 
     /// Between two windows: sets the batches from `first` on, and forgets how they got there.
@@ -88,45 +85,14 @@ impl<M: Model> Ensemble<M> {
 /// Batches that stay in any case: an ensemble of fewer says nothing about its spread.
 const LEAST_BATCHES: usize = 2;
 
-/// Mean and root of the covariance.
-struct Moments {
-    mean: Vec<f64>,
-    /// `[n x n]`, lower triangular.
-    root: Vec<f64>,
-}
-
-impl Moments {
-    fn of(rows: &[f64], members: usize) -> Self {
-        let mut root = Vec::new();
-        covariance_root(rows, members, &mut root);
-        Self { mean: rows.chunks_exact(members).map(|row| mean_and_sd(row).0).collect(), root }
-    }
-
-    /// `root^-1` times centred rows `[n x members]`; zero in directions without spread.
-    fn whitened(&self, mut rows: Vec<f64>, members: usize) -> Vec<f64> {
-        let n = self.mean.len();
-        for i in 0..n {
-            let (known, rest) = rows.split_at_mut(i * members);
-            let row = &mut rest[..members];
-            for (other, factor) in known.chunks_exact(members).zip(&self.root[i * n..]) {
-                row.iter_mut().zip(other).for_each(|(value, z)| *value -= factor * z);
-            }
-            let pivot = self.root[i * n + i];
-            row.iter_mut().for_each(|value| *value = if pivot > 0.0 { *value / pivot } else { 0.0 });
+/// `mean + root z`, `[n x members]`.
+fn spread(moments: &Cloud, z: &[f64], members: usize) -> Vec<f64> {
+    let mut out = Vec::with_capacity(z.len());
+    for (mean, root) in moments.mean().iter().zip(moments.root().chunks_exact(moments.len())) {
+        for i in 0..members {
+            let terms = root.iter().enumerate().map(|(k, factor)| factor * z[k * members + i]);
+            out.push(mean + terms.sum::<f64>());
         }
-        rows
     }
-
-    /// `mean + root z`, `[n x members]`.
-    fn spread(&self, z: &[f64], members: usize) -> Vec<f64> {
-        let n = self.mean.len();
-        let mut out = Vec::with_capacity(z.len());
-        for (mean, root) in self.mean.iter().zip(self.root.chunks_exact(n)) {
-            for i in 0..members {
-                let terms = root.iter().enumerate().map(|(k, factor)| factor * z[k * members + i]);
-                out.push(mean + terms.sum::<f64>());
-            }
-        }
-        out
-    }
+    out
 }

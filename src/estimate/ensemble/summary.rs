@@ -1,6 +1,7 @@
 //! What the members say together.
 
-use super::{Ensemble, coordinates};
+use super::Ensemble;
+use super::rows::coordinates;
 use crate::estimate::batch::{Tools, read};
 use crate::estimate::smoother::Remembered;
 use crate::estimate::statistics::{Explainers, Summary, mean_and_sd, summarise};
