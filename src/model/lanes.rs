@@ -255,6 +255,8 @@ pub trait LaneModel: Copy + fmt::Debug + Send + Sync {
     type Fixed: Copy;
     /// What depends on the time only.
     type Moment: Copy + Default;
+    /// What a moment comes from.
+    type Instant: Copy + Default;
     /// What `df/dx` depends on beside the time.
     type Tangent: Copy + Default;
     /// See [`LaneModel::relaxation`].
@@ -267,10 +269,19 @@ pub trait LaneModel: Copy + fmt::Debug + Send + Sync {
     fn change(&self, fixed: &mut Self::Fixed, theta: &[Lanes], parameter: usize);
 
     /// At `t_s` after the start of the window.
-    fn moment(fixed: &Self::Fixed, t_s: f64) -> Self::Moment;
+    fn instant(fixed: &Self::Fixed, t_s: f64) -> Self::Instant;
+
+    /// What equations need of it.
+    fn moment(fixed: &Self::Fixed, instant: &Self::Instant) -> Self::Moment;
 
     /// Derivative of [`LaneModel::moment`] by a parameter for which [`LaneModel::is_timed`].
-    fn moment_by(&self, fixed: &Self::Fixed, t_s: f64, theta: &[Lanes], parameter: usize) -> Self::Moment;
+    fn moment_by(
+        &self,
+        fixed: &Self::Fixed,
+        at: (f64, &Self::Instant),
+        theta: &[Lanes],
+        parameter: usize,
+    ) -> Self::Moment;
 
     /// Whether moments depend on a parameter.
     fn is_timed(parameter: usize) -> bool;
@@ -319,6 +330,7 @@ impl LaneModel for NoLanes {
     type State = [Lanes; 0];
     type Fixed = ();
     type Moment = ();
+    type Instant = ();
     type Tangent = ();
     type Relaxation = ();
 
@@ -328,9 +340,11 @@ impl LaneModel for NoLanes {
 
     fn change(&self, (): &mut (), _: &[Lanes], _: usize) {}
 
-    fn moment((): &(), _: f64) {}
+    fn instant((): &(), _: f64) {}
 
-    fn moment_by(&self, (): &(), _: f64, _: &[Lanes], _: usize) {}
+    fn moment((): &(), (): &()) {}
+
+    fn moment_by(&self, (): &(), _: (f64, &()), _: &[Lanes], _: usize) {}
 
     fn is_timed(_: usize) -> bool {
         false

@@ -10,6 +10,10 @@ const MAX_HALVINGS: usize = 8;
 /// Relative growth of the objective that is rounding.
 const ROUNDING: f64 = 1e-13;
 
+/// Where no share of a step that promised more than this made things better twice, and between the two they got no better
+/// by more than this, the objective has a corner, and the iteration stays at it. In shares of the objective.
+const PROGRESS: f64 = 0.01;
+
 /// Scratch of the solver; reuse it from window to window.
 #[derive(Debug, Clone, Default)]
 pub struct CollocationSolver {
@@ -38,6 +42,18 @@ pub struct CollocationSolver {
     predicted: Vec<f64>,
     /// Whether the step was shortened to its limits.
     limited: bool,
+    /// Objective where no share of a step made it smaller; infinite before that.
+    stuck_at: f64,
+}
+
+/// What came of a step.
+enum Step {
+    /// The linearisation was not right yet.
+    On,
+    /// It was.
+    Converged,
+    /// No share of the step leads on.
+    Corner,
 }
 
 impl CollocationSolver {
@@ -50,7 +66,8 @@ impl CollocationSolver {
         evaluate(&mut self.point, problem, &self.phi);
 
         let mut account = Account::default();
-        while account.iterations < problem.stopping.max_iterations && !account.converged {
+        self.stuck_at = f64::INFINITY;
+        while account.iterations < problem.stopping.max_iterations {
             account.iterations += 1;
             self.linearise(problem);
             account.condition = self.blocks.assemble_and_factorise(problem, &self.jacobians);
@@ -58,7 +75,14 @@ impl CollocationSolver {
                 break;
             }
             self.full_step(problem);
-            account.converged = self.take_step(problem);
+            match self.take_step(problem) {
+                Step::On => {}
+                Step::Converged => {
+                    account.converged = true;
+                    break;
+                }
+                Step::Corner => break,
+            }
         }
         self.point.finish(problem, account, out);
     }
@@ -118,6 +142,7 @@ impl CollocationSolver {
         self.limited = false;
         resize(&mut self.step_xi, problem.prior.n_xi);
         resize(&mut self.predicted, self.point.physics.len());
+        self.rho.clear();
         if !problem.data.is_empty() {
             self.solve_in_sample_space(problem);
         }
@@ -186,10 +211,10 @@ impl CollocationSolver {
         self.limited = limit_step(problem, &mut self.step_xi);
     }
 
-    /// Moves along the step, shortened while the objective grows; true if the linearisation was right.
-    fn take_step<M: Model>(&mut self, problem: &WindowProblem<'_, M>) -> bool {
+    /// Moves along the step, shortened while the objective grows.
+    fn take_step<M: Model>(&mut self, problem: &WindowProblem<'_, M>) -> Step {
         let before = self.point.objective(problem);
-        let mut share = 1.0;
+        let (mut share, mut better) = (1.0, false);
         for _ in 0..=MAX_HALVINGS {
             self.trial.clone_from(&self.point);
             self.trial.beta.iter_mut().zip(&self.step_beta).for_each(|(x, s)| *x += share * s);
@@ -197,15 +222,33 @@ impl CollocationSolver {
             self.trial.place(problem);
             evaluate(&mut self.trial, problem, &self.phi);
             // Growth by rounding is none: near the minimiser, halved steps would never get there.
-            if self.trial.objective(problem) <= before * (1.0 + ROUNDING) || self.agrees(problem, share) {
+            better = self.trial.objective(problem) <= before * (1.0 + ROUNDING) || self.agrees(problem, share);
+            if better {
                 break;
             }
             share *= 0.5;
         }
+        // The far side of a corner may lead on, so that one such step is taken; and another, if it did.
+        if !better {
+            let promised = self.promised(problem) < (1.0 - PROGRESS) * before;
+            if promised && before > (1.0 - PROGRESS) * self.stuck_at {
+                return Step::Corner;
+            }
+            self.stuck_at = before;
+        }
         // A limited step is no minimiser, however well it was predicted.
         let converged = !self.limited && share > 0.75 && self.agrees(problem, share);
         std::mem::swap(&mut self.point, &mut self.trial);
-        converged
+        if converged { Step::Converged } else { Step::On }
+    }
+
+    /// The objective after a full step, if the equations were as linear as they look.
+    fn promised<M: Model>(&self, problem: &WindowProblem<'_, M>) -> f64 {
+        let nodes = problem.basis.positions().len();
+        let rows = self.predicted.chunks_exact(nodes).zip(problem.physics_weights);
+        let physics: f64 = rows.map(|(row, w)| w * w * dot(row, row)).sum();
+        let xi: f64 = self.point.xi.iter().zip(&self.step_xi).map(|(xi, step)| (xi + step).powi(2)).sum();
+        physics + dot(&self.rho, &self.rho) + xi
     }
 
     /// Whether the residuals of the trial are what the linearisation said.

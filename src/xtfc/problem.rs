@@ -179,7 +179,7 @@ pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
 }
 
 /// A point in the space of unknowns, and the residuals there. Shared by the solvers.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Default)]
 pub(super) struct Point {
     pub beta: Vec<f64>,
     pub xi: Vec<f64>,
@@ -193,6 +193,27 @@ pub(super) struct Point {
     pub physics: Vec<f64>,
     /// Weighted data residual, `[n_data]`.
     pub data: Vec<f64>,
+}
+
+impl Clone for Point {
+    fn clone(&self) -> Self {
+        let mut clone = Self::default();
+        clone.clone_from(self);
+        clone
+    }
+
+    /// Into the vectors that are there.
+    fn clone_from(&mut self, other: &Self) {
+        let Self { beta, xi, start, theta, x, f, physics, data } = other;
+        self.beta.clone_from(beta);
+        self.xi.clone_from(xi);
+        self.start.clone_from(start);
+        self.theta.clone_from(theta);
+        self.x.clone_from(x);
+        self.f.clone_from(f);
+        self.physics.clone_from(physics);
+        self.data.clone_from(data);
+    }
 }
 
 impl Point {

@@ -217,6 +217,8 @@ type AtNodes<T, const N: usize> = [T; N];
 struct Equations<'a, M: LaneModel, const N: usize> {
     fixed: M::Fixed,
     moments: &'a mut AtNodes<M::Moment, N>,
+    /// Kept where derivatives by parameters are needed.
+    instants: Option<&'a mut AtNodes<M::Instant, N>>,
     expressions: &'a Expressions,
 }
 
@@ -246,8 +248,9 @@ impl<'a, M: LaneModel, const N: usize> Equations<'a, M, N> {
         expressions: &'a Expressions,
         theta: &[Lanes],
         moments: &'a mut AtNodes<M::Moment, N>,
+        instants: Option<&'a mut AtNodes<M::Instant, N>>,
     ) -> Option<Self> {
-        let mut equations = Self { fixed: model.fixed(theta)?, moments, expressions };
+        let mut equations = Self { fixed: model.fixed(theta)?, moments, instants, expressions };
         equations.set_moments();
         Some(equations)
     }
@@ -265,8 +268,12 @@ impl<'a, M: LaneModel, const N: usize> Equations<'a, M, N> {
 
     #[inline(always)]
     fn set_moments(&mut self) {
-        for (moment, t_s) in self.moments.iter_mut().zip(&self.expressions.times_s) {
-            *moment = M::moment(&self.fixed, *t_s);
+        for (node, (moment, t_s)) in self.moments.iter_mut().zip(&self.expressions.times_s).enumerate() {
+            let instant = M::instant(&self.fixed, *t_s);
+            *moment = M::moment(&self.fixed, &instant);
+            if let Some(instants) = &mut self.instants {
+                instants[node] = instant;
+            }
         }
     }
 
@@ -473,7 +480,7 @@ impl<M: LaneModel, const N: usize> pulp::NullaryFnOnce for Forecast<'_, M, N> {
     fn call(self) -> Self::Output {
         let Self { model, expressions, limit, solutions } = self;
         let (mut moments, mut slopes) = ([M::Moment::default(); N], [M::State::default(); N]);
-        let equations = Equations::<M, N>::new(model, expressions, &solutions.theta, &mut moments)?;
+        let equations = Equations::<M, N>::new(model, expressions, &solutions.theta, &mut moments, None)?;
         let (mut path, tangent) = Path::straight(&equations, &solutions.start, &mut slopes);
         let (mut tangents, mut relaxations) = ([M::Tangent::default(); N], [M::Relaxation::default(); N]);
         let mut at = Tangents::<M, N> { tangents: &mut tangents, relaxations: &mut relaxations };
@@ -512,7 +519,9 @@ impl<M: LaneModel, const N: usize> pulp::NullaryFnOnce for Fit<'_, M, N> {
     fn call(self) -> Self::Output {
         let Self { model, expressions, samples, freedom, tolerance_mmhg, scratch, solutions } = self;
         let (mut moments, mut slopes) = ([M::Moment::default(); N], [M::State::default(); N]);
-        let mut equations = Equations::<M, N>::new(model, expressions, &solutions.theta, &mut moments)?;
+        let mut instants = [M::Instant::default(); N];
+        let mut equations =
+            Equations::<M, N>::new(model, expressions, &solutions.theta, &mut moments, Some(&mut instants))?;
         let nodes = equations.nodes();
         let mean = state::<M>(&solutions.start);
         let mut path = Path::<M, N> { start: mean, slopes: &mut slopes };
@@ -539,6 +548,10 @@ impl<M: LaneModel, const N: usize> pulp::NullaryFnOnce for Fit<'_, M, N> {
         }
         scratch.advance();
         let mut progress = Progress { sweeps: 0, done: [false; WIDTH], physics_rms: Lanes::default() };
+        let mut of_dual = M::State::default();
+        for (factor, weight) in of_dual.as_mut().iter_mut().zip(freedom.physics_weights) {
+            *factor = Lanes::splat(-1.0 / (weight * weight));
+        }
         let limit = Lanes::splat(tolerance_mmhg / expressions.length_s);
         let (mut left, mut dual_left) = (Left::START, Left::START);
         while progress.sweeps < MAX_ROUNDS {
@@ -561,8 +574,8 @@ impl<M: LaneModel, const N: usize> pulp::NullaryFnOnce for Fit<'_, M, N> {
 
             // Errors of the equations, states at the start and parameters follow from that.
             for (error, g) in errors[..nodes].iter_mut().zip(dual.g.iter()) {
-                for ((error, g), weight) in error.as_mut().iter_mut().zip(g.as_ref()).zip(freedom.physics_weights) {
-                    *error = *g * Lanes::splat(-1.0 / (weight * weight));
+                for ((error, g), factor) in error.as_mut().iter_mut().zip(g.as_ref()).zip(of_dual.as_ref()) {
+                    *error = *g * *factor;
                 }
             }
             let within =
@@ -626,9 +639,9 @@ fn pull_back<M: LaneModel, const N: usize>(
         let mut sum = Lanes::default();
         for (node, (x, g)) in states[..equations.nodes()].iter().zip(dual.g.iter()).enumerate() {
             let mut by = None;
-            if timed {
-                let t_s = equations.expressions.times_s[node];
-                by = Some(model.moment_by(&equations.fixed, t_s, theta, p));
+            if let Some(instants) = equations.instants.as_ref().filter(|_| timed) {
+                let at = (equations.expressions.times_s[node], &instants[node]);
+                by = Some(model.moment_by(&equations.fixed, at, theta, p));
             }
             sum = sum + M::push(&equations.fixed, (&equations.moments[node], by.as_ref()), x, g, p);
         }

@@ -63,6 +63,17 @@ pub struct Moment {
     right: Ventricle,
 }
 
+/// What a moment comes from.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Instant {
+    activation: Activation,
+    /// Since the beat began \[s\].
+    time_s: Lanes,
+    /// `1/C` of the ventricles, left and right, and the inverse of their product.
+    elastances: [Lanes; 2],
+    inverse: Lanes,
+}
+
 /// Conductances of the valves, 0 where they are closed.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Tangent {
@@ -73,6 +84,7 @@ pub struct Tangent {
 }
 
 /// See [`crate::model::capacitance::Activation`].
+#[derive(Debug, Clone, Copy, Default)]
 struct Activation {
     value: Lanes,
     d_t: Lanes,
@@ -134,22 +146,25 @@ impl Activation {
 }
 
 #[allow(clippy::inline_always)]
-impl Ventricle {
+impl Instant {
+    /// Derivatives of a moment, from those of the elastances and of their rates.
     #[inline(always)]
-    fn both(activation: &Activation, left: &Swing, right: &Swing) -> Moment {
-        let (l, r) = (left.relaxed + left.half * activation.value, right.relaxed + right.half * activation.value);
-        // One division for both.
-        let share = activation.d_t / (l * r);
+    fn by(&self, fixed: &Fixed, elastances: [Lanes; 2], rates: [Lanes; 2]) -> Moment {
+        let [l, r] = self.elastances;
+        // `1/l` and `1/r` without another division.
+        let (over_l, over_r) = (self.inverse * r, self.inverse * l);
+        let stiffening =
+            [fixed.left.half * self.activation.d_t * over_l, fixed.right.half * self.activation.d_t * over_r];
         Moment {
-            left: Self { elastance: l, stiffening: left.half * share * r },
-            right: Self { elastance: r, stiffening: right.half * share * l },
+            left: Ventricle {
+                elastance: elastances[0],
+                stiffening: (rates[0] - stiffening[0] * elastances[0]) * over_l,
+            },
+            right: Ventricle {
+                elastance: elastances[1],
+                stiffening: (rates[1] - stiffening[1] * elastances[1]) * over_r,
+            },
         }
-    }
-
-    /// When the elastance and its rate change.
-    #[inline(always)]
-    fn by(&self, elastance: Lanes, rate: Lanes) -> Self {
-        Self { elastance, stiffening: (rate - self.stiffening * elastance) / self.elastance }
     }
 }
 
@@ -230,6 +245,7 @@ impl LaneModel for Cvsim6 {
     type State = [Lanes; 6];
     type Fixed = Fixed;
     type Moment = Moment;
+    type Instant = Instant;
     type Tangent = Tangent;
     type Relaxation = Relaxation;
 
@@ -282,9 +298,22 @@ impl LaneModel for Cvsim6 {
     }
 
     #[inline(always)]
-    fn moment(fixed: &Fixed, t_s: f64) -> Moment {
-        let activation = Activation::at(&fixed.clock, fixed.clock.time_in_beat(t_s));
-        Ventricle::both(&activation, &fixed.left, &fixed.right)
+    fn instant(fixed: &Fixed, t_s: f64) -> Instant {
+        let time_s = fixed.clock.time_in_beat(t_s);
+        let activation = Activation::at(&fixed.clock, time_s);
+        let (left, right) = (&fixed.left, &fixed.right);
+        let (l, r) = (left.relaxed + left.half * activation.value, right.relaxed + right.half * activation.value);
+        Instant { activation, time_s, elastances: [l, r], inverse: Lanes::splat(1.0) / (l * r) }
+    }
+
+    #[inline(always)]
+    fn moment(fixed: &Fixed, instant: &Instant) -> Moment {
+        let [l, r] = instant.elastances;
+        let share = instant.activation.d_t * instant.inverse;
+        Moment {
+            left: Ventricle { elastance: l, stiffening: fixed.left.half * share * r },
+            right: Ventricle { elastance: r, stiffening: fixed.right.half * share * l },
+        }
     }
 
     fn is_timed(parameter: usize) -> bool {
@@ -294,13 +323,10 @@ impl LaneModel for Cvsim6 {
     }
 
     #[inline(always)]
-    fn moment_by(&self, fixed: &Fixed, t_s: f64, theta: &[Lanes], parameter: usize) -> Moment {
+    fn moment_by(&self, fixed: &Fixed, (t_s, instant): (f64, &Instant), theta: &[Lanes], parameter: usize) -> Moment {
         use Parameter as P;
         let is = |p: P| parameter == p as usize;
-        let clock = &fixed.clock;
-        let time_s = clock.time_in_beat(t_s);
-        let activation = Activation::at(clock, time_s);
-        let Moment { left, right } = Ventricle::both(&activation, &fixed.left, &fixed.right);
+        let (clock, Instant { activation, time_s, .. }) = (&fixed.clock, instant);
         let (zero, half) = (Lanes::splat(0.0), Lanes::splat(0.5));
 
         if is(P::HeartRate) || is(P::Systole) || is(P::BeatPhase) {
@@ -315,14 +341,12 @@ impl LaneModel for Cvsim6 {
                     SystoleRule::Fraction => zero - clock.systole_s * per_rate,
                     SystoleRule::Bazett => zero - half * clock.systole_s * per_rate,
                 };
-                ((Lanes::splat(t_s) - time_s) * per_rate, systole)
+                ((Lanes::splat(t_s) - *time_s) * per_rate, systole)
             };
             let value = activation.d_t * time + activation.d_ts * systole;
             let slope = activation.d_tt * time + activation.d_t_ts * systole;
-            return Moment {
-                left: left.by(fixed.left.half * value, fixed.left.half * slope),
-                right: right.by(fixed.right.half * value, fixed.right.half * slope),
-            };
+            let (left, right) = (fixed.left.half, fixed.right.half);
+            return instant.by(fixed, [left * value, right * value], [left * slope, right * slope]);
         }
         let c = theta[parameter];
         let (value, slope) = (half * activation.value / (c * c), half * activation.d_t / (c * c));
@@ -332,9 +356,9 @@ impl LaneModel for Cvsim6 {
             (zero - value, zero - slope)
         };
         if is(P::CLDia) || is(P::CLSys) {
-            Moment { left: left.by(value, slope), right: Ventricle::default() }
+            instant.by(fixed, [value, zero], [slope, zero])
         } else {
-            Moment { left: Ventricle::default(), right: right.by(value, slope) }
+            instant.by(fixed, [zero, value], [zero, slope])
         }
     }
 
@@ -468,7 +492,7 @@ impl LaneModel for Cvsim6 {
     #[inline(always)]
     fn derive(&self, t_s: f64, x: &[Lanes; 6], theta: &[Lanes], out: &mut [Lanes]) -> bool {
         let Some(fixed) = self.fixed(theta) else { return false };
-        let moment = <Self as LaneModel>::moment(&fixed, t_s);
+        let moment = <Self as LaneModel>::moment(&fixed, &Self::instant(&fixed, t_s));
         let (_, tangent) = <Self as LaneModel>::linearise(&fixed, &moment, x);
         let [l, a, v, r, pa, pv] = *x;
         let of = |p: Parameter| theta[p as usize];
@@ -554,7 +578,8 @@ mod tests {
             for Case { thetas, xs, duals } in cases(model) {
                 let (theta, x, dual) = (lanes::<37>(&thetas), lanes::<6>(&xs), lanes::<6>(&duals));
                 let fixed = model.fixed(&theta).unwrap();
-                let moment = <Cvsim6 as LaneModel>::moment(&fixed, T_S);
+                let instant = Cvsim6::instant(&fixed, T_S);
+                let moment = <Cvsim6 as LaneModel>::moment(&fixed, &instant);
                 let (slopes, tangent) = <Cvsim6 as LaneModel>::linearise(&fixed, &moment, &x);
                 let pulled = <Cvsim6 as LaneModel>::pull(&fixed, &moment, &tangent, &dual);
                 let mut derived = [Lanes::default(); 12];
@@ -581,9 +606,10 @@ mod tests {
             for Case { thetas, xs, duals } in cases(model) {
                 let (theta, x, dual) = (lanes::<37>(&thetas), lanes::<6>(&xs), lanes::<6>(&duals));
                 let fixed = model.fixed(&theta).unwrap();
-                let moment = <Cvsim6 as LaneModel>::moment(&fixed, T_S);
+                let instant = Cvsim6::instant(&fixed, T_S);
+                let moment = <Cvsim6 as LaneModel>::moment(&fixed, &instant);
                 for p in (0..37).filter(|&p| LaneModel::knows(&model, p)) {
-                    let by = Cvsim6::is_timed(p).then(|| model.moment_by(&fixed, T_S, &theta, p));
+                    let by = Cvsim6::is_timed(p).then(|| model.moment_by(&fixed, (T_S, &instant), &theta, p));
                     let found = <Cvsim6 as LaneModel>::push(&fixed, (&moment, by.as_ref()), &x, &dual, p);
                     for lane in 0..WIDTH {
                         let mut column = vec![0.0; 6];
@@ -606,7 +632,8 @@ mod tests {
             }
             let (theta, x, residual) = (lanes::<37>(&thetas), lanes::<6>(&xs), lanes::<6>(&duals));
             let fixed = model.fixed(&theta).unwrap();
-            let moment = <Cvsim6 as LaneModel>::moment(&fixed, T_S);
+            let instant = Cvsim6::instant(&fixed, T_S);
+            let moment = <Cvsim6 as LaneModel>::moment(&fixed, &instant);
             let (_, tangent) = <Cvsim6 as LaneModel>::linearise(&fixed, &moment, &x);
             let phi = 3e-4;
             for transposed in [false, true] {
