@@ -198,5 +198,44 @@ fn windows(criterion: &mut Criterion) {
     }
 }
 
-criterion_group!(benches, windows);
+/// Independent products and sums, as many as the processor can take on: its peak without fused multiply-add, which the
+/// kernels do without. Elements are floating-point operations.
+struct Peak {
+    values: [Lanes; CHAINS],
+    rounds: usize,
+}
+
+const CHAINS: usize = 12;
+
+#[allow(clippy::inline_always)]
+impl pulp::NullaryFnOnce for Peak {
+    type Output = [Lanes; CHAINS];
+
+    #[inline(always)]
+    fn call(self) -> Self::Output {
+        let (mut values, factor, term) = (self.values, Lanes::splat(0.999), Lanes::splat(0.001));
+        for _ in 0..self.rounds {
+            for value in &mut values {
+                *value = *value * factor + term;
+            }
+        }
+        values
+    }
+}
+
+fn peak(criterion: &mut Criterion) {
+    const ROUNDS: usize = 1000;
+    let mut group = criterion.benchmark_group("peak");
+    group.throughput(Throughput::Elements((2 * WIDTH * CHAINS * ROUNDS) as u64));
+    group.warm_up_time(Duration::from_millis(500)).measurement_time(Duration::from_secs(2)).sample_size(20);
+    for set in InstructionSet::ALL.into_iter().filter(|set| set.is_available()) {
+        group.bench_function(BenchmarkId::from_parameter(set.name()), |bencher| {
+            let values = std::array::from_fn(|chain| Lanes::splat(chain as f64));
+            bencher.iter(|| set.run(Peak { values: black_box(values), rounds: ROUNDS }));
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, windows, peak);
 criterion_main!(benches);

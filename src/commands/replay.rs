@@ -10,7 +10,7 @@ use hemostream::edge::replay::{Bed, ReplayOptions, Source, run, wait_for_listene
 use hemostream::edge::zenoh::ZenohBus;
 
 use super::serve::{asked_to_stop, tokio_runtime};
-use super::simulate::positive;
+use super::simulate::{not_negative, positive};
 use super::{ConfigArgs, Failure, log_to_stderr, say};
 
 /// Publish a patient, synthetic or recorded, at its own pace
@@ -43,6 +43,9 @@ pub(crate) struct Replay {
     /// Length of a block of samples [s]
     #[arg(long, default_value_t = 0.01, value_parser = positive)]
     block_s: f64,
+    /// Time from the start of one bed to that of the next [s]
+    #[arg(long, default_value_t = 0.01, value_parser = not_negative)]
+    stagger_s: f64,
     /// Event time of the first sample of a synthetic patient, added to the times of a record [s]
     #[arg(long, default_value_t = 0.0)]
     start_s: f64,
@@ -71,6 +74,7 @@ impl Replay {
             speed: self.speed,
             seconds: self.seconds,
             block_s: self.block_s,
+            stagger_s: self.stagger_s,
             start_s: self.start_s,
             repeat: self.repeat,
             ..ReplayOptions::default()

@@ -8,6 +8,7 @@ use hemostream::edge::bus::Bus;
 use hemostream::edge::config::Config;
 use hemostream::edge::zenoh::ZenohBus;
 use hemostream::edge::{inlet, outlet::Outlet};
+use hemostream::runtime::bed::Account;
 use hemostream::runtime::clock::Clock;
 use hemostream::runtime::service::{Inlet, Limits, Service};
 use hemostream::runtime::workers::Workers;
@@ -26,7 +27,7 @@ pub(crate) struct Serve {
 /// A running daemon within this process.
 pub(crate) struct Running {
     inlet: Inlet,
-    task: tokio::task::JoinHandle<()>,
+    task: tokio::task::JoinHandle<Account>,
     _listening: Vec<hemostream::edge::bus::Subscription>,
 }
 
@@ -51,13 +52,42 @@ impl Running {
     /// Finishes what is waiting and stops.
     pub(crate) async fn stop(self) {
         self.inlet.stop().await;
-        if tokio::time::timeout(Duration::from_secs(10), self.task).await.is_err() {
-            tracing::warn!("the service did not stop in time");
+        match tokio::time::timeout(Duration::from_secs(10), self.task).await {
+            Ok(Ok(account)) => summarise(&account),
+            _ => tracing::warn!("the service did not stop in time"),
         }
         if self.inlet.dropped() > 0 {
             tracing::warn!(dropped = self.inlet.dropped(), "messages were dropped because the service was behind");
         }
     }
+}
+
+/// What the run came to, for whoever reads the log.
+#[allow(clippy::cast_precision_loss)]
+fn summarise(account: &Account) {
+    let lag = |quantile: f64| account.lag_us.as_ref().map_or(f64::NAN, |h| h.value_at_quantile(quantile) as f64 / 1e3);
+    let resident_mb = resident_bytes().map_or(f64::NAN, |bytes| bytes as f64 / 1e6);
+    tracing::info!(
+        beds = account.beds,
+        windows = account.windows,
+        lost = account.lost,
+        one_by_one = account.one_by_one,
+        not_converged = account.not_converged,
+        lag_p50_ms = lag(0.5),
+        lag_p99_ms = lag(0.99),
+        lag_max_ms = lag(1.0),
+        resident_mb,
+        resident_mb_per_bed = resident_mb / account.beds.max(1) as f64,
+        "stopped"
+    );
+}
+
+/// Memory of this process; None where the system does not tell.
+fn resident_bytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
+    let kib: u64 = line.trim().strip_suffix("kB")?.trim().parse().ok()?;
+    Some(kib * 1024)
 }
 
 /// A tokio runtime small enough to leave the cores to the solves.

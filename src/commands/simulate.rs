@@ -41,6 +41,11 @@ pub(crate) fn positive(text: &str) -> Result<f64, String> {
     if value > 0.0 && value.is_finite() { Ok(value) } else { Err("expected a number above 0".to_owned()) }
 }
 
+pub(crate) fn not_negative(text: &str) -> Result<f64, String> {
+    let value = text.parse::<f64>().map_err(|e| e.to_string())?;
+    if value >= 0.0 && value.is_finite() { Ok(value) } else { Err("expected 0 or a number above it".to_owned()) }
+}
+
 impl Simulate {
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn run(&self) -> Result<(), Failure> {

@@ -53,6 +53,9 @@ pub struct ReplayOptions {
     pub seconds: Option<f64>,
     /// Length of a block \[s\].
     pub block_s: f64,
+    /// Time from one bed to the next \[s\]: patients are not connected in the same instant, and their monitors do not send
+    /// at the same moment.
+    pub stagger_s: f64,
     /// Event time of the start \[s\].
     pub start_s: f64,
     /// What is true, this often per second; 0 never.
@@ -68,6 +71,7 @@ impl Default for ReplayOptions {
             speed: 1.0,
             seconds: None,
             block_s: 0.01,
+            stagger_s: 0.0,
             start_s: 0.0,
             truth_rate_hz: 50.0,
             repeat: false,
@@ -121,7 +125,8 @@ pub struct Bed {
     sequences: Vec<u64>,
     /// Rows waiting to be sent: event time and values by state.
     waiting: Vec<(EventTime, Vec<Option<f64>>)>,
-    truths: Vec<Truth>,
+    /// True values at some of these times.
+    truths: Vec<(EventTime, Vec<f64>)>,
     next_truth_ns: i64,
     done: bool,
 }
@@ -165,7 +170,8 @@ impl Bed {
                 let observed = patient.observe().into_iter().map(Some).collect();
                 let time = EventTime(start_ns + elapsed_ns);
                 if options.truth_rate_hz > 0.0 && elapsed_ns >= self.next_truth_ns {
-                    self.truths.push(truth(patient, time));
+                    let values = patient.truth().into_iter().chain(patient.parameters().iter().copied());
+                    self.truths.push((time, values.collect()));
                     self.next_truth_ns += ns_from_s(1.0 / options.truth_rate_hz);
                 }
                 self.waiting.push((time, observed));
@@ -225,15 +231,21 @@ impl Bed {
             bus.publish(message, Delivery::Samples)?;
         }
         self.waiting.clear();
-        for truth in std::mem::take(&mut self.truths) {
-            let key = format!("{}/{}/truth", config.publish.prefix, self.name);
-            let twin = format!("{key}/json");
-            if config.publish.json && bus.is_wanted(&twin) {
+        let key = format!("{}/{}/truth", config.publish.prefix, self.name);
+        let twin = format!("{key}/json");
+        let (wanted, twin_wanted) = (bus.is_wanted(&key), config.publish.json && bus.is_wanted(&twin));
+        for (time, values) in self.truths.drain(..) {
+            if !(wanted || twin_wanted) {
+                continue;
+            }
+            let Source::Synthetic(patient) = &self.source else { continue };
+            let truth = Truth { schema: SCHEMA, time_ns: time.0, names: truth_names(patient), values };
+            if twin_wanted {
                 let payload = truth.to_json().to_string().into_bytes();
-                bus.publish(Message { key: twin, encoding: Encoding::Json, payload }, Delivery::Estimates)?;
+                bus.publish(Message { key: twin.clone(), encoding: Encoding::Json, payload }, Delivery::Estimates)?;
             }
             let payload = wire::encode(&truth)?;
-            bus.publish(Message { key, encoding: Encoding::Bincode, payload }, Delivery::Estimates)?;
+            bus.publish(Message { key: key.clone(), encoding: Encoding::Bincode, payload }, Delivery::Estimates)?;
         }
         Ok(())
     }
@@ -247,12 +259,10 @@ fn by_state(states: &[usize], row: &Row) -> Vec<Option<f64>> {
     values
 }
 
-fn truth(patient: &SyntheticPatient, time: EventTime) -> Truth {
+fn truth_names(patient: &SyntheticPatient) -> Vec<String> {
     let model = patient.model();
     let quantities = model.states().iter().chain(model.derived()).map(|q| q.name.to_owned());
-    let names = quantities.chain(model.parameters().iter().map(|p| p.name.to_owned())).collect();
-    let values = patient.truth().into_iter().chain(patient.parameters().iter().copied()).collect();
-    Truth { schema: SCHEMA, time_ns: time.0, names, values }
+    quantities.chain(model.parameters().iter().map(|p| p.name.to_owned())).collect()
 }
 
 /// Waits for somebody to listen to a bed: a subscription takes a moment to get here, and what is published before it
@@ -286,31 +296,37 @@ pub fn run(
 ) -> Result<f64, ReplayError> {
     let clock = Clock::start();
     let block_ns = ns_from_s(options.block_s).max(1);
+    let stagger_ns = ns_from_s(options.stagger_s);
     let mut origin: Option<i64> = None;
-    let mut sent_ns = 0_i64;
-    while beds.iter().any(|bed| !bed.done) && !stop.load(Ordering::Relaxed) {
-        // Samples up to here exist once the clock says so.
-        let until = sent_ns.saturating_add(block_ns);
-        for bed in beds.iter_mut().filter(|bed| !bed.done) {
-            let mut more = true;
-            while more && bed.waiting.last().is_none_or(|(t, _)| t.0 - origin.unwrap_or(t.0) < until) {
-                more = bed.make_row(config, options)?;
-                if let Some((t, _)) = bed.waiting.first() {
-                    origin.get_or_insert(t.0);
-                }
-            }
-            bed.done = !more;
-        }
-        wait_until(&clock, s_from_ns(until) / options.speed, stop);
-        for bed in beds.iter_mut() {
-            if !bed.waiting.is_empty() || bed.done {
-                bed.flush(bus, config, bed.done)?;
+    // How far each bed has got, and when the clock says that its next block exists.
+    let mut sent_ns = vec![0_i64; beds.len()];
+    let due_ns = |bed: usize, sent_ns: i64| {
+        let delay_ns = stagger_ns.saturating_mul(i64::try_from(bed).unwrap_or(i64::MAX));
+        sent_ns.saturating_add(block_ns).saturating_add(delay_ns)
+    };
+    while !stop.load(Ordering::Relaxed) {
+        let under_way = (0..beds.len()).filter(|&i| !beds[i].done);
+        let Some(next) = under_way.min_by_key(|&i| due_ns(i, sent_ns[i])) else { break };
+        let bed = &mut beds[next];
+        let until = sent_ns[next].saturating_add(block_ns);
+        let mut more = true;
+        while more && bed.waiting.last().is_none_or(|(t, _)| t.0 - origin.unwrap_or(t.0) < until) {
+            more = bed.make_row(config, options)?;
+            if let Some((t, _)) = bed.waiting.first() {
+                origin.get_or_insert(t.0);
             }
         }
-        beds.iter_mut().filter(|bed| bed.done).for_each(|bed| bed.sequences.fill(0));
-        sent_ns = until;
+        bed.done = !more;
+        wait_until(&clock, s_from_ns(due_ns(next, sent_ns[next])) / options.speed, stop);
+        if !bed.waiting.is_empty() || bed.done {
+            bed.flush(bus, config, bed.done)?;
+        }
+        if bed.done {
+            bed.sequences.fill(0);
+        }
+        sent_ns[next] = until;
     }
-    Ok(s_from_ns(sent_ns))
+    Ok(s_from_ns(sent_ns.into_iter().max().unwrap_or(0)))
 }
 
 fn wait_until(clock: &Clock, seconds: f64, stop: &AtomicBool) {

@@ -46,6 +46,9 @@ impl ZenohBus {
         };
         let listen = serde_json::json!(settings.listen).to_string();
         let connect = serde_json::json!(settings.connect).to_string();
+        // Samples are sent one by one. A client has nothing better to do than to wait a moment until the link takes them;
+        // a daemon must not let one subscriber that hangs hold up the others.
+        let patience_us = if settings.mode == ZenohMode::Client { "50000" } else { "1000" };
         let mut config = zenoh::Config::default();
         for (key, value) in [
             ("mode", format!("\"{mode}\"").as_str()),
@@ -54,6 +57,8 @@ impl ZenohBus {
             ("scouting/multicast/enabled", "false"),
             ("scouting/gossip/enabled", "false"),
             ("transport/shared_memory/enabled", "false"),
+            ("transport/link/tx/queue/size/real_time", "16"),
+            ("transport/link/tx/queue/congestion_control/drop/wait_before_drop", patience_us),
         ] {
             config.insert_json5(key, value).map_err(|e| transport(format!("{key} = {value}: {e}")))?;
         }

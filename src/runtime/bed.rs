@@ -67,7 +67,7 @@ pub struct Health {
     pub windows: u64,
     /// Of these, without a sample.
     pub windows_without_data: u64,
-    /// Median lag from closing to estimate \[ms\], over windows since the start.
+    /// Median lag from the closing of a window to its estimates being handed over for publishing \[ms\], over windows since the start.
     pub lag_p50_ms: f64,
     /// 99th percentile.
     pub lag_p99_ms: f64,
@@ -89,6 +89,23 @@ pub struct Health {
     pub disagreement: Option<(Disagreement, Vec<usize>)>,
 }
 
+/// What beds did, all together.
+#[derive(Debug, Clone, Default)]
+pub struct Account {
+    /// Beds.
+    pub beds: usize,
+    /// Windows solved.
+    pub windows: u64,
+    /// Member-windows that the kernels left to the general solver.
+    pub one_by_one: u64,
+    /// Member-windows that did not converge.
+    pub not_converged: u64,
+    /// Messages and samples that were lost or refused.
+    pub lost: u64,
+    /// From the closing of a window to what is said of it handed over \[us\].
+    pub lag_us: Option<Histogram<u64>>,
+}
+
 /// A bed.
 pub struct Bed {
     /// Its name.
@@ -100,8 +117,11 @@ pub struct Bed {
     members_alive: usize,
     iterations: u64,
     not_converged: u64,
+    one_by_one: u64,
     solve_ms: f64,
     lag_us: Option<Histogram<u64>>,
+    /// When the windows were closed of which nothing is said yet.
+    closed: Vec<ArrivalTime>,
     counters: BTreeMap<&'static str, u64>,
     /// Last event about each cause.
     reported: BTreeMap<&'static str, ArrivalTime>,
@@ -124,8 +144,10 @@ impl Bed {
             members_alive: estimator.settings().members,
             iterations: 0,
             not_converged: 0,
+            one_by_one: 0,
             solve_ms: 0.0,
             lag_us: Histogram::new_with_max(MAX_LAG_US, 3).ok(),
+            closed: Vec::new(),
             counters: BTreeMap::new(),
             reported: BTreeMap::new(),
             expected: vec![None; channels],
@@ -176,6 +198,33 @@ impl Bed {
         None
     }
 
+    /// What was put out by the last task has been handed over.
+    pub(super) fn handed_over(&mut self) {
+        let now = self.clock.now();
+        for closed_at in self.closed.drain(..) {
+            let lag_us = u64::try_from(now.ns_since(closed_at) / 1000).unwrap_or(0);
+            if let Some(histogram) = &mut self.lag_us {
+                histogram.saturating_record(lag_us);
+            }
+        }
+    }
+
+    /// Adds what this bed did.
+    pub(super) fn account(&self, all: &mut Account) {
+        all.beds += 1;
+        all.windows += self.windows;
+        all.one_by_one += self.one_by_one;
+        all.not_converged += self.not_converged;
+        let lost = self.counters.values().chain(self.estimator.refused().values());
+        all.lost = lost.fold(all.lost, |sum, n| sum.saturating_add(*n));
+        if let (Some(all), Some(own)) = (&mut all.lag_us, &self.lag_us) {
+            // Of the same range, so that they fit.
+            let _ = all.add(own);
+        } else {
+            all.lag_us.clone_from(&self.lag_us);
+        }
+    }
+
     /// Counts a message that the edge did not understand, and says so once in a while.
     fn refuse(&mut self, cause: &'static str, arrived: ArrivalTime, out: &mut Vec<Output>) {
         *self.counters.entry(cause).or_default() += 1;
@@ -222,11 +271,9 @@ impl Bed {
             self.members_alive = window.report.solved;
             self.iterations += window.report.iterations as u64;
             self.not_converged += window.report.not_converged as u64;
+            self.one_by_one += window.report.one_by_one as u64;
             self.last_window = window.end;
-            let lag_us = u64::try_from(finished.ns_since(window.closed_at) / 1000).unwrap_or(0);
-            if let Some(histogram) = &mut self.lag_us {
-                histogram.saturating_record(lag_us);
-            }
+            self.closed.push(window.closed_at);
         }
         if windows > 0 {
             let per_window_ms = s_from_ns(finished.ns_since(started)) * 1e3 / f64::from(windows);

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use tokio::sync::mpsc;
 
-use super::bed::{Bed, Health, Task};
+use super::bed::{Account, Bed, Health, Task};
 use super::clock::Clock;
 use super::governor::{self, Governor};
 use super::workers::Workers;
@@ -20,6 +20,13 @@ use crate::model::discrepancy::Circulation;
 
 /// How often beds without input are told that time has passed.
 const TICK: Duration = Duration::from_millis(20);
+
+/// With more beds than workers, what comes in for a bed is gathered for this long: the blocks of several sensors, which
+/// close windows only together, take one turn then, and not one each.
+const GATHER: Duration = Duration::from_millis(2);
+
+/// [`governor::SETTLED`] \[ns\].
+const SETTLED_NS: i64 = governor::SETTLED.as_millis() as i64 * 1_000_000;
 
 /// Tasks a worker does for one bed before other beds get their turn.
 const TURN: usize = 64;
@@ -118,10 +125,14 @@ pub struct Service {
     beds: BTreeMap<String, Slot>,
     /// Beds that workers have.
     away: usize,
+    /// Whether some bed gathers.
+    gathering: bool,
     governor: Governor,
     /// Time that workers have spent, and when that was looked at last.
     busy_ns: Arc<AtomicU64>,
     looked: (ArrivalTime, u64),
+    /// When the last new bed appeared.
+    newest: Option<ArrivalTime>,
     too_many_beds: u64,
     /// Events that did not fit into the queue, counted by the inlet.
     dropped: Arc<AtomicU64>,
@@ -156,23 +167,27 @@ impl Service {
             returned,
             beds: BTreeMap::new(),
             away: 0,
+            gathering: false,
             governor: Governor::default(),
             busy_ns: Arc::default(),
             looked: (clock.now(), 0),
+            newest: None,
             too_many_beds: 0,
             dropped: Arc::clone(&inlet.dropped),
         };
         Ok((service, inlet))
     }
 
-    /// Runs until it is told to stop; what is waiting then is still done.
-    pub async fn run(mut self) {
+    /// Runs until it is told to stop; what is waiting then is still done. Returns what was done.
+    pub async fn run(mut self) -> Account {
         let mut tick = tokio::time::interval(TICK);
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
         let mut report = tokio::time::interval(self.limits.report_every);
         report.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
         let mut look = tokio::time::interval(governor::PERIOD);
         look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
+        let mut gather = tokio::time::interval(GATHER / 2);
+        gather.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
         let mut stopping = false;
         while !(stopping && self.is_idle()) {
             tokio::select! {
@@ -182,6 +197,7 @@ impl Service {
                 _ = look.tick() => self.look(),
                 _ = tick.tick(), if !stopping => self.tick(),
                 _ = report.tick(), if !stopping => self.report(),
+                _ = gather.tick(), if self.gathering => self.dispatch(),
                 Some(event) = self.events.recv(), if !stopping => match event {
                     Event::Task { bed, task } => self.enqueue(&bed, task),
                     Event::Stop => {
@@ -193,6 +209,18 @@ impl Service {
                 else => break,
             }
         }
+        let mut account = Account { lost: self.dropped.load(Ordering::Relaxed), ..Account::default() };
+        for slot in self.beds.values() {
+            account.lost = account.lost.saturating_add(slot.queue_full);
+            slot.bed.iter().for_each(|bed| bed.account(&mut account));
+        }
+        account
+    }
+
+    /// How long tasks of a bed are gathered \[ns\].
+    fn gather_ns(&self) -> i64 {
+        let many = self.beds.len() > self.workers.threads();
+        if many { i64::try_from(GATHER.as_nanos()).unwrap_or(0) } else { 0 }
     }
 
     fn is_idle(&self) -> bool {
@@ -247,6 +275,7 @@ impl Service {
             tracing::info!(bed = name, "new bed");
             let slot = Slot { bed: Some(bed), waiting: VecDeque::new(), queue_full: 0, touched: now, share: 1.0 };
             self.beds.insert(name.to_owned(), slot);
+            self.newest = Some(now);
         }
         let limit = self.limits.queue_tasks;
         if let Some(slot) = self.beds.get_mut(name) {
@@ -257,17 +286,25 @@ impl Service {
                 slot.touched = now;
             }
         }
-        self.dispatch();
+        if self.gather_ns() > 0 {
+            self.gathering = true;
+        } else {
+            self.dispatch();
+        }
     }
 
     /// Hands beds to the workers, those first whose samples have waited longest: all windows have the same time to be
     /// solved in, so that the earliest deadline is that of the earliest arrival. One more than there are workers, so that
     /// none waits for this loop.
     fn dispatch(&mut self) {
+        let (now, gather_ns) = (self.clock.now(), self.gather_ns());
         while self.away <= self.workers.threads() {
-            let ready = self.beds.iter_mut().filter(|(_, slot)| slot.bed.is_some());
-            let first = ready.filter_map(|(name, slot)| Some((slot.waiting.front()?.1, name, slot)));
-            let Some((_, name, slot)) = first.min_by_key(|(arrived, name, _)| (*arrived, *name)) else { return };
+            let there = self.beds.iter_mut().filter(|(_, slot)| slot.bed.is_some());
+            let first = there.filter_map(|(name, slot)| Some((slot.waiting.front()?.1, name, slot)));
+            let first = first.min_by_key(|(arrived, name, _)| (*arrived, *name));
+            // When the first is not ready yet, no other is.
+            self.gathering = first.as_ref().is_some_and(|(arrived, ..)| now.ns_since(*arrived) < gather_ns);
+            let Some((_, name, slot)) = first.filter(|_| !self.gathering) else { return };
             let Some(mut bed) = slot.bed.take() else { return };
             let mut tasks: Vec<_> = slot.waiting.drain(..slot.waiting.len().min(TURN)).collect();
             let share = self.governor.share();
@@ -307,7 +344,8 @@ impl Service {
         let waits = self.beds.values().filter_map(|slot| Some(now.ns_since(slot.waiting.front()?.1)));
         let longest = Duration::from_nanos(u64::try_from(waits.max().unwrap_or(0)).unwrap_or(0));
         let busy = if available > 0.0 { (busy_ns - busy_before) as f64 / available } else { 0.0 };
-        if let Some(share) = self.governor.look(longest, busy) {
+        let beginning = self.newest.is_some_and(|newest| now.ns_since(newest) < SETTLED_NS);
+        if let Some(share) = self.governor.look(longest, busy, beginning) {
             let (beds, waited_ms) = (self.beds.len(), longest.as_millis());
             if share < 1.0 {
                 tracing::warn!(beds, share, busy, "overload: samples have waited {waited_ms} ms");
@@ -348,5 +386,6 @@ fn work_through(bed: &mut Bed, tasks: Vec<(Task, ArrivalTime)>, parallel: &dyn P
             sink.put(bed, &outputs, health.as_ref());
             outputs.clear();
         }
+        bed.handed_over();
     }
 }

@@ -18,6 +18,7 @@ use hemostream::estimate::estimator::{Estimate, Estimator, Input, Output};
 use hemostream::estimate::statistics::Summary;
 use hemostream::estimate::time::{ArrivalTime, EventTime, s_from_ns};
 use hemostream::estimate::window::RawSample;
+use hemostream::runtime::bed::Account;
 use hemostream::runtime::clock::Clock;
 use hemostream::runtime::service::{Inlet, Limits, Service};
 use hemostream::runtime::workers::Workers;
@@ -55,7 +56,7 @@ struct Daemon {
     bus: MemoryBus,
     inlet: Inlet,
     outlet: Arc<Outlet>,
-    service: tokio::task::JoinHandle<()>,
+    service: tokio::task::JoinHandle<Account>,
     said: Arc<Mutex<Vec<Message>>>,
     subscriptions: Vec<Subscription>,
 }
