@@ -6,7 +6,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput};
 use hemostream::edge::config::Config;
@@ -152,6 +152,7 @@ fn service(criterion: &mut Criterion) {
     let config = Config::load_from(None, [], &sets).unwrap().0;
     let (model, settings) = (Cvsim6::default(), config.estimator_settings().unwrap());
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+    let clock = Clock::start();
     let mut group = criterion.benchmark_group(SERVICE);
     group.warm_up_time(Duration::from_millis(300)).measurement_time(Duration::from_secs(5)).sample_size(10);
     for beds in BEDS {
@@ -161,8 +162,7 @@ fn service(criterion: &mut Criterion) {
         let (workers, said) = (Arc::new(Workers::start(0).unwrap()), Arc::clone(&sink));
         let _inside = runtime.enter();
         let (service, inlet) =
-            Service::new(config.circulation().unwrap(), settings.clone(), limits, workers, said, Clock::start())
-                .unwrap();
+            Service::new(config.circulation().unwrap(), settings.clone(), limits, workers, said, clock).unwrap();
         let task = runtime.spawn(service.run());
         let theta = model.default_parameters();
         let mut patient = Simulator::new(model, Cvsim6::initial_pressures(&theta).unwrap(), theta, vec![]);
@@ -182,7 +182,7 @@ fn service(criterion: &mut Criterion) {
                     }
                     sample += 1;
                 }
-                let started = Instant::now();
+                let started = clock.now();
                 for bed in 0..beds {
                     for (channel, samples) in samples.iter().enumerate() {
                         let task = Task::Samples { channel, sequence: block, last: false, samples: samples.clone() };
@@ -195,7 +195,7 @@ fn service(criterion: &mut Criterion) {
                 while sink.0.load(Ordering::Acquire) < expected {
                     std::thread::sleep(Duration::from_micros(100));
                 }
-                spent += started.elapsed();
+                spent += Duration::from_nanos(u64::try_from(clock.now().ns_since(started)).unwrap());
             }
             spent
         };
@@ -261,7 +261,7 @@ fn draw() {
     let channels: Vec<usize> = (1..=CHANNELS.len()).collect();
     let figure = Figure::new("", 3)
         .panel(of_members)
-        .panel(chart("window [ms]", windows, false))
+        .panel(chart("window (ms)", windows, false))
         .panel(chart("neurons and nodes", points(GROUP, &whole(&NEURONS), "neurons", false), true))
         .panel(chart("channels", points(GROUP, &channels, "channels", false), false))
         .panel(chart("beds, on all cores", points(SERVICE, &BEDS, "beds", true), false));

@@ -44,6 +44,7 @@
 
 pub mod benchmarks {
     #![doc = include_str!("benchmarks.md")]
+    #![doc = include_str!("benchmarks.svg")]
 }
 pub mod edge;
 pub mod estimate;

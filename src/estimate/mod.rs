@@ -8,6 +8,7 @@
 //! | [`ensemble`] | the members, one step of all of them, the second look, their clocks, how many take part, what they say together |
 //! | [`batch`] | eight members: their features, states and parameters, and one window of work on them |
 //! | [`coupling`] | what is free in a window and what the prior is: `independent`, `coupled` |
+//! | [`cloud`] | rows over the members as a cloud: mean, covariance, directions |
 //! | [`random`] | noise over the members with exact moments |
 //! | [`adapt`] | what is learnt about the assumptions: the pace of parameters, the noise of sensors, the fit of the model |
 //! | `rivals` | the unscented and the ensemble Kalman filter behind the same interface |

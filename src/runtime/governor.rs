@@ -18,8 +18,8 @@ pub const PERIOD: Duration = Duration::from_millis(250);
 /// A wait that says that the machine cannot keep up.
 pub const TOO_LONG: Duration = Duration::from_millis(100);
 
-/// Time after which a bed needs no more than it will.
-pub const SETTLED: Duration = Duration::from_millis(1500);
+/// Time after which a bed needs no more than it will, and what had piled up when it began is done.
+pub const SETTLED: Duration = Duration::from_secs(5);
 
 /// A wait that is none.
 const SHORT: Duration = Duration::from_millis(40);
