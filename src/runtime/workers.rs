@@ -1,5 +1,6 @@
 //! A fixed pool of threads for the solves.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use rayon::iter::{IndexedParallelIterator, IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
@@ -50,22 +51,18 @@ impl Workers {
     /// Runs `job` in this pool with all other threads awake and waiting for parts of it: those of a window are so short
     /// that a thread that sleeps would come too late. Meant for one job that is to be done as fast as the machine goes.
     pub fn concentrate<T: Send>(&self, job: impl FnOnce() -> T + Send) -> T {
-        let (awake, over) = (AtomicUsize::new(0), Alone(AtomicBool::new(false)));
-        let over = &over.0;
-        let keep_awake = || {
-            awake.fetch_add(1, Ordering::Relaxed);
-            while !over.load(Ordering::Relaxed) {
-                if rayon::yield_now() != Some(rayon::Yield::Executed) {
-                    std::hint::spin_loop();
-                }
-            }
-        };
+        // Nothing that a waiting thread looks at lies near anything that a working one writes.
+        let (awake, over) = (Arc::new(Alone(AtomicUsize::new(0))), Arc::new(Alone(AtomicBool::new(false))));
+        let others = self.threads() - 1;
         self.pool.install(|| {
             rayon::scope(|scope| {
-                let _end = OnDrop(over);
-                (1..self.threads()).for_each(|_| scope.spawn(|_| keep_awake()));
+                let _end = OnDrop(Arc::clone(&over));
+                for _ in 0..others {
+                    let (awake, over) = (Arc::clone(&awake), Arc::clone(&over));
+                    scope.spawn(move |_| keep_awake(&awake, &over));
+                }
                 // They must not be left to this thread, which would then wait for itself.
-                while awake.load(Ordering::Relaxed) + 1 < self.threads() {
+                while awake.0.load(Ordering::Relaxed) < others {
                     std::hint::spin_loop();
                 }
                 job()
@@ -88,12 +85,21 @@ impl Workers {
 #[repr(align(128))]
 struct Alone<T>(T);
 
-/// Says so when it is over, also by a panic.
-struct OnDrop<'a>(&'a AtomicBool);
+fn keep_awake(awake: &Alone<AtomicUsize>, over: &Alone<AtomicBool>) {
+    awake.0.fetch_add(1, Ordering::Relaxed);
+    while !over.0.load(Ordering::Relaxed) {
+        if rayon::yield_now() != Some(rayon::Yield::Executed) {
+            std::hint::spin_loop();
+        }
+    }
+}
 
-impl Drop for OnDrop<'_> {
+/// Says so when it is over, also by a panic.
+struct OnDrop(Arc<Alone<AtomicBool>>);
+
+impl Drop for OnDrop {
     fn drop(&mut self) {
-        self.0.store(true, Ordering::Relaxed);
+        self.0.0.store(true, Ordering::Relaxed);
     }
 }
 
