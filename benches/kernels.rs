@@ -16,7 +16,9 @@ use hemostream::xtfc::basis::Basis;
 use hemostream::xtfc::collocation::CollocationSolver;
 use hemostream::xtfc::features::{FeatureSpec, RandomFeatures};
 use hemostream::xtfc::problem::{Datum, Prior, Solution, Stopping, Unknowns, WindowProblem};
-use hemostream::xtfc::sweeps::{Covariance, Expressions, FitScratch, Freedom, Samples, Solutions, fit, forecast};
+use hemostream::xtfc::sweeps::{
+    Covariance, Expressions, FitScratch, Freedom, Samples, Shared, Solutions, fit, forecast,
+};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -131,10 +133,14 @@ fn windows(criterion: &mut Criterion) {
         group.warm_up_time(Duration::from_millis(500)).measurement_time(Duration::from_secs(2)).sample_size(20);
         for set in InstructionSet::ALL.into_iter().filter(|set| set.is_available()) {
             let mut batches: Vec<Solutions> = cases.iter().map(solutions).collect();
+            // What all members share is worked out for every eight of them here, not for a hundred.
+            let phase = [Parameter::BeatPhase as usize];
+            let mut shared = Shared::new(model, &batches[0].theta, &coupled.unknowns.parameters).unwrap();
             group.bench_function(BenchmarkId::new("without samples", set.name()), |bencher| {
                 bencher.iter(|| {
                     for batch in &mut batches {
-                        black_box(forecast(&model, &expressions, 1e-9, set, batch));
+                        shared.begin(&batch.theta, &phase, &expressions, set);
+                        black_box(forecast(&shared, &expressions, 1e-9, set, batch));
                     }
                 });
             });
@@ -156,7 +162,8 @@ fn windows(criterion: &mut Criterion) {
                             precision: None,
                         };
                         let places = (&mut scratch, &mut batch);
-                        black_box(fit(&model, &expressions, &samples, &freedom, 1e-9, set, places));
+                        shared.begin(&from.theta, &phase, &expressions, set);
+                        black_box(fit(&shared, &expressions, &samples, &freedom, 1e-9, set, places));
                     }
                 });
             });

@@ -1,6 +1,7 @@
 //! Eight members of the ensemble: where they are, how they went through the last window, and the work of one window on
 //! them. Solved side by side where the model has equations for lanes, one by one by the general solver where not.
 
+use super::beat::Curve;
 use super::coupling::independent;
 use super::ensemble::Observation;
 use super::settings::EstimatorSettings;
@@ -8,10 +9,10 @@ use crate::model::Model;
 use crate::model::lanes::{LaneModel, Lanes, WIDTH};
 use crate::model::rk4::{MAX_STEP_S, Rk4};
 use crate::xtfc::basis::Basis;
-use crate::xtfc::collocation::CollocationSolver;
+use crate::xtfc::collocation::{CollocationSolver, Guess};
 use crate::xtfc::dense;
 use crate::xtfc::problem::{Datum, Prior, Solution, Unknowns, WindowProblem};
-use crate::xtfc::sweeps::{self, Covariance, Expressions, FitScratch, Freedom, Progress, Samples, Solutions};
+use crate::xtfc::sweeps::{self, Covariance, Expressions, FitScratch, Freedom, Progress, Samples, Shared, Solutions};
 
 /// Positions in the window whose expressions are remembered: sensors sample evenly, so that few of them come again and
 /// again.
@@ -24,14 +25,24 @@ const MAX_SAMPLES: usize = 32;
 #[derive(Debug)]
 pub(super) struct Tools<'a, M: Model> {
     pub model: &'a M,
-    /// Its equations for lanes; None where members are solved one by one.
-    pub lanes: Option<&'a M::Lanes>,
+    /// Equations for lanes; None where members are solved one by one.
+    pub shared: Option<&'a Shared<M::Lanes>>,
     pub settings: &'a EstimatorSettings,
     pub unknowns: &'a Unknowns,
     /// Estimated parameters.
     pub estimated: &'a [usize],
     /// Parameters that are not the same for ever: what is estimated, and clocks.
     pub varying: &'a [usize],
+    /// At the end of the window.
+    pub look: Look,
+}
+
+/// Whether members look at where all their quantities are, and what their last look stands for \[s\] if that is not in
+/// their curves yet.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Look {
+    pub is_due: bool,
+    pub last_s: Option<f64>,
 }
 
 /// The samples of a window, and what is believed before them.
@@ -88,7 +99,7 @@ pub struct Batch {
     bases: Vec<Basis>,
     /// Largest number of coefficients of a state.
     rank: usize,
-    expressions: Option<Expressions>,
+    pub(super) expressions: Option<Expressions>,
     /// States at the end of the last window, `[n_states]`.
     pub(super) x: Vec<Lanes>,
     /// Parameters there, clocks moved on, `[n_parameters]`.
@@ -97,6 +108,8 @@ pub struct Batch {
     pub(super) window: Solutions,
     /// What they expect of the samples of this window, `[n_observations]`.
     pub(super) expected: Vec<Lanes>,
+    /// The beat under way.
+    pub(super) curve: Curve,
     /// Whether the last solve gave numbers.
     pub(super) solved: [bool; WIDTH],
     pub(super) tally: Tally,
@@ -107,6 +120,7 @@ pub struct Batch {
     phi: Vec<Lanes>,
     values: Vec<Lanes>,
     variances: Vec<Lanes>,
+    derived: Vec<Lanes>,
     scratch: FitScratch,
     one: One,
 }
@@ -118,6 +132,8 @@ struct One {
     theta: Vec<f64>,
     data: Vec<Datum>,
     root: Vec<f64>,
+    beta: Vec<f64>,
+    xi: Vec<f64>,
     solver: CollocationSolver,
     solution: Solution,
     rk4: Rk4,
@@ -139,6 +155,7 @@ impl Batch {
             x,
             theta,
             expected: Vec::new(),
+            curve: Curve::default(),
             solved: [true; WIDTH],
             tally: Tally::default(),
             positions: Vec::new(),
@@ -148,6 +165,7 @@ impl Batch {
             phi: Vec::new(),
             values: Vec::new(),
             variances: Vec::new(),
+            derived: Vec::new(),
             scratch: FitScratch::default(),
             one: One::default(),
         };
@@ -187,13 +205,13 @@ impl Batch {
         self.tally = Tally::default();
         self.begin(tools);
         let settings = tools.settings;
-        let progress = tools.lanes.zip(self.expressions.as_ref()).and_then(|(lanes, expressions)| {
+        let progress = tools.shared.zip(self.expressions.as_ref()).map(|(shared, expressions)| {
             let tolerance = settings.stopping.tolerance_mmhg;
-            sweeps::forecast(lanes, expressions, tolerance, settings.instructions, &mut self.window)
+            sweeps::forecast(shared, expressions, tolerance, settings.instructions, &mut self.window)
         });
         self.take(progress, |batch, lane| {
             batch.one.data.clear();
-            batch.solve_one(tools, lane, None);
+            batch.solve_one(tools, lane, None, false);
         });
     }
 
@@ -256,8 +274,9 @@ impl Batch {
         }
         // The account of the forecast is not that of the window.
         self.tally = Tally::default();
-        let kernel = tools.lanes.zip(self.expressions.as_ref()).filter(|_| lesson.observations.len() <= MAX_SAMPLES);
-        let progress = kernel.and_then(|(lanes, expressions)| {
+        let kernel = tools.shared.zip(self.expressions.as_ref()).filter(|_| lesson.observations.len() <= MAX_SAMPLES);
+        let is_tried = kernel.is_some();
+        let progress = kernel.map(|(shared, expressions)| {
             let covariance =
                 lesson.shared.map_or(Covariance::Own(&self.variances), |prior| Covariance::Shared(prior.covariance));
             let freedom = Freedom {
@@ -270,7 +289,7 @@ impl Batch {
                 Samples { states: &self.states, weights: &self.weights, phi: &self.phi, values: &self.values };
             let tolerance = settings.stopping.tolerance_mmhg;
             let places = (&mut self.scratch, &mut self.window);
-            sweeps::fit(lanes, expressions, &samples, &freedom, tolerance, settings.instructions, places)
+            sweeps::fit(shared, expressions, &samples, &freedom, tolerance, settings.instructions, places)
         });
         self.take(progress, |batch, lane| {
             let data = lesson.observations.iter().enumerate().map(|(k, o)| Datum {
@@ -281,15 +300,15 @@ impl Batch {
             });
             batch.one.data.clear();
             batch.one.data.extend(data);
-            batch.solve_one(tools, lane, Some(lesson));
+            batch.solve_one(tools, lane, Some(lesson), is_tried);
         });
     }
 
-    /// One member by the general solver; a forecast without a lesson.
-    fn solve_one<M: Model>(&mut self, tools: &Tools<'_, M>, lane: usize, lesson: Option<&Lesson<'_>>) {
+    /// One member by the general solver, from where the kernel gave up if it `is_tried`; a forecast without a lesson.
+    fn solve_one<M: Model>(&mut self, tools: &Tools<'_, M>, lane: usize, lesson: Option<&Lesson<'_>>, is_tried: bool) {
         let nothing_free = Unknowns::default();
         let Some(basis) = self.bases.get(lane) else { return };
-        let One { x, theta, data, root, solver, solution, .. } = &mut self.one;
+        let One { x, theta, data, root, beta, xi, solver, solution, .. } = &mut self.one;
         read(&self.x, lane, x);
         read(&self.theta, lane, theta);
         let (unknowns, prior) = match lesson {
@@ -319,7 +338,14 @@ impl Batch {
             stopping: tools.settings.stopping,
         };
         if basis.is_nodal() {
-            solver.solve(&problem, solution);
+            let off = data.iter().zip(&self.expected).map(|(d, expected)| d.weight * (expected.0[lane] - d.value));
+            let below = off.map(|off| off * off).sum();
+            let guess = is_tried.then(|| {
+                read(&self.window.beta, lane, beta);
+                self.scratch.xi(lane, prior.root, prior.n_xi, xi);
+                Guess { beta, xi, below }
+            });
+            solver.solve_from(&problem, guess, solution);
         } else {
             dense::solve(&problem, solution);
         }
@@ -364,6 +390,21 @@ impl Batch {
         }
         self.fill_up();
         advance(tools, h, &mut self.theta);
+        if tools.look.is_due {
+            self.look(tools);
+        }
+    }
+
+    /// Looks at where all quantities are at the end of the window.
+    pub(super) fn look<M: Model>(&mut self, tools: &Tools<'_, M>) {
+        if let Some(dt_s) = tools.look.last_s {
+            self.curve.take_in(dt_s, tools.settings.instructions);
+        }
+        let mut derived = std::mem::take(&mut self.derived);
+        derived.resize(tools.model.derived().len(), Lanes::default());
+        self.derive_at(tools, tools.settings.window.length_s(), &self.x, &mut derived);
+        self.curve.look(&self.x, &derived);
+        self.derived = derived;
     }
 
     /// As if the last window had been spent where the members are now.
@@ -479,11 +520,9 @@ impl Batch {
     }
 
     /// Derived quantities of the states `x` at `t_s` after the start of the window, `[n_derived]`.
-    pub(super) fn derive_at<M: Model>(&self, tools: &Tools<'_, M>, t_s: f64, x: &[Lanes], out: &mut Vec<Lanes>) {
-        out.clear();
-        out.resize(tools.model.derived().len(), Lanes::default());
-        let job = Derive { lanes: tools.lanes, t_s, x, theta: &self.window.theta, out };
-        if tools.settings.instructions.run(job) {
+    pub(super) fn derive_at<M: Model>(&self, tools: &Tools<'_, M>, t_s: f64, x: &[Lanes], out: &mut [Lanes]) {
+        if let Some(shared) = tools.shared {
+            sweeps::derive(shared, t_s, tools.settings.instructions, (x, &self.window.theta), out);
             return;
         }
         let (mut one, mut theta, mut derived) = (Vec::new(), Vec::new(), vec![0.0; out.len()]);
@@ -509,6 +548,7 @@ impl Batch {
         copy(&donor.window.start, of, &mut self.window.start, lane);
         copy(&donor.window.theta, of, &mut self.window.theta, lane);
         copy(&donor.window.end, of, &mut self.window.end, lane);
+        self.curve.replace(lane, (&donor.curve, of));
         if let (Some(own), Some(basis)) = (self.bases.get_mut(lane), donor.bases.get(of)) {
             // Coefficients belong to the donor's basis.
             own.clone_from(basis);
@@ -525,32 +565,10 @@ impl Batch {
     }
 }
 
-/// What runs in code for an instruction set.
-struct Derive<'a, L> {
-    lanes: Option<&'a L>,
-    t_s: f64,
-    x: &'a [Lanes],
-    theta: &'a [Lanes],
-    out: &'a mut [Lanes],
-}
-
-#[allow(clippy::inline_always)]
-impl<L: LaneModel> pulp::NullaryFnOnce for Derive<'_, L> {
-    type Output = bool;
-
-    #[inline(always)]
-    fn call(self) -> bool {
-        let Some(lanes) = self.lanes else { return false };
-        let mut x = L::State::default();
-        x.as_mut().copy_from_slice(self.x);
-        lanes.derive(self.t_s, &x, self.theta, self.out)
-    }
-}
-
 /// Moves clocks on.
 fn advance<M: Model>(tools: &Tools<'_, M>, dt_s: f64, theta: &mut [Lanes]) {
-    if let Some(lanes) = tools.lanes {
-        lanes.advance(dt_s, theta);
+    if let Some(shared) = tools.shared {
+        shared.model().advance(dt_s, theta);
         return;
     }
     let mut one = Vec::new();

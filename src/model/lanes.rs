@@ -252,9 +252,9 @@ pub trait LaneModel: Copy + fmt::Debug + Send + Sync {
     /// A state of every member, `[Lanes; n_states]`.
     type State: Copy + AsRef<[Lanes]> + AsMut<[Lanes]> + Default;
     /// What does not change over a window.
-    type Fixed: Copy;
+    type Fixed: Copy + Send + Sync;
     /// What depends on the time only.
-    type Moment: Copy + Default;
+    type Moment: Copy + Default + Send + Sync;
     /// What a moment comes from.
     type Instant: Copy + Default;
     /// What `df/dx` depends on beside the time.
@@ -314,9 +314,8 @@ pub trait LaneModel: Copy + fmt::Debug + Send + Sync {
         parameter: usize,
     ) -> Lanes;
 
-    /// Derived quantities at a time, `[n_derived]`; false, with nothing done, where these equations are not those of the
-    /// model.
-    fn derive(&self, t_s: f64, x: &Self::State, theta: &[Lanes], out: &mut [Lanes]) -> bool;
+    /// Derived quantities at a moment, `[n_derived]`.
+    fn derive(at: (&Self::Fixed, &Self::Moment), x: &Self::State, theta: &[Lanes], out: &mut [Lanes]);
 
     /// [`super::Model::advance`], by each lane's own time.
     fn advance(&self, dt_s: f64, theta: &mut [Lanes]);
@@ -376,9 +375,7 @@ impl LaneModel for NoLanes {
         Lanes::default()
     }
 
-    fn derive(&self, _: f64, _: &Self::State, _: &[Lanes], _: &mut [Lanes]) -> bool {
-        false
-    }
+    fn derive(_: (&(), &()), _: &Self::State, _: &[Lanes], _: &mut [Lanes]) {}
 
     fn advance(&self, _: f64, _: &mut [Lanes]) {}
 }

@@ -1,7 +1,8 @@
 //! A fixed pool of threads for the solves.
 
-use std::sync::Arc;
+use std::slice::IterMut;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use rayon::iter::{IndexedParallelIterator, IntoParallelIterator, IntoParallelRefIterator, ParallelIterator};
 
@@ -103,20 +104,48 @@ impl Drop for OnDrop {
     }
 }
 
-/// In equal parts, one per thread: batches cost alike, and a window is too short to share it out piece by piece.
-/// What is to be done beside goes with the first part, which is the smaller one where they are not equal.
-fn split(batches: &mut [Batch], parts: usize, job: &(dyn Fn(&mut Batch) + Sync), beside: &mut (dyn FnMut() + Send)) {
-    if parts < 2 || batches.len() < 2 {
-        batches.iter_mut().for_each(job);
+/// Whoever is free takes the next batch: most cost alike, but a member that needs the general solver costs as much as the
+/// rest of its batch many times over. This thread takes them from the front and others from the back, so that most stay
+/// in the cache that they are in. What is to be done beside is done first.
+fn share_out(
+    batches: &mut [Batch],
+    threads: usize,
+    job: &(dyn Fn(&mut Batch) + Sync),
+    beside: &mut (dyn FnMut() + Send),
+) {
+    if threads < 2 {
         beside();
+        batches.iter_mut().for_each(job);
         return;
     }
-    let (first, rest) = batches.split_at_mut(batches.len() / parts);
-    let first_part = || {
-        first.iter_mut().for_each(job);
+    let rest = Mutex::new(batches.iter_mut());
+    // Functions of their own: the lock is not held while a job is done.
+    let (first, last) = (|| lock(&rest).next(), || lock(&rest).next_back());
+    let from_front = || {
         beside();
+        while let Some(batch) = first() {
+            job(batch);
+        }
     };
-    rayon::join(|| split(rest, parts - 1, job, &mut || {}), first_part);
+    let from_back = || {
+        while let Some(batch) = last() {
+            job(batch);
+        }
+    };
+    rayon::join(from_front, || side_by_side(threads - 1, &from_back));
+}
+
+/// No job is done while it is held, so that none can panic.
+fn lock<'a, 'b>(rest: &'a Mutex<IterMut<'b, Batch>>) -> MutexGuard<'a, IterMut<'b, Batch>> {
+    rest.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn side_by_side(threads: usize, work: &(dyn Fn() + Sync)) {
+    if threads > 1 {
+        rayon::join(work, || side_by_side(threads - 1, work));
+    } else {
+        work();
+    }
 }
 
 impl Parallel for Workers {
@@ -128,10 +157,10 @@ impl Parallel for Workers {
     ) {
         let threads = self.threads();
         if threads == 1 || self.pool.current_thread_index().is_some() {
-            split(batches, threads, job, beside);
+            share_out(batches, threads, job, beside);
         } else {
             // From outside, the hand-over costs as much as a short window.
-            self.pool.install(|| split(batches, threads, job, beside));
+            self.pool.install(|| share_out(batches, threads, job, beside));
         }
     }
 

@@ -10,8 +10,14 @@ const MAX_HALVINGS: usize = 8;
 /// Relative growth of the objective that is rounding.
 const ROUNDING: f64 = 1e-13;
 
-/// Where no share of a step that promised more than this made things better twice, and between the two they got no better
-/// by more than this, the objective has a corner, and the iteration stays at it. In shares of the objective.
+/// A step leads nowhere if, shortened, it makes the objective smaller by less than this share of what the full one promised,
+/// and that would have been worth having. Where more than so many did, and between them it got smaller by no more than
+/// that is worth, the objective has a corner, and the iteration stays at it.
+const LEAST_KEPT: f64 = 0.1;
+
+const MAX_STALLS: usize = 4;
+
+/// What is worth having, in shares of the objective.
 const PROGRESS: f64 = 0.01;
 
 /// Scratch of the solver; reuse it from window to window.
@@ -42,8 +48,20 @@ pub struct CollocationSolver {
     predicted: Vec<f64>,
     /// Whether the step was shortened to its limits.
     limited: bool,
-    /// Objective where no share of a step made it smaller; infinite before that.
+    /// Objective where a step led nowhere, infinite before that, and how often it did since it was that small.
     stuck_at: f64,
+    stalls: usize,
+}
+
+/// Where to begin.
+#[derive(Debug, Clone, Copy)]
+pub struct Guess<'a> {
+    /// Slopes at the nodes, `[n_states x n_nodes]`.
+    pub beta: &'a [f64],
+    /// `[n_xi]`
+    pub xi: &'a [f64],
+    /// Objective above which it is not worth having: that of the solution without samples.
+    pub below: f64,
 }
 
 /// What came of a step.
@@ -59,14 +77,34 @@ enum Step {
 impl CollocationSolver {
     /// Minimises; `problem.basis` must be nodal ([`super::basis::Basis::is_nodal`]).
     pub fn solve<M: Model>(&mut self, problem: &WindowProblem<'_, M>, out: &mut Solution) {
+        self.solve_from(problem, None, out);
+    }
+
+    /// The same from a guess, if that is worth having; else from constant slopes and the prior mean.
+    pub fn solve_from<M: Model>(
+        &mut self,
+        problem: &WindowProblem<'_, M>,
+        guess: Option<Guess<'_>>,
+        out: &mut Solution,
+    ) {
         debug_assert!(problem.basis.is_nodal(), "the square solver needs a nodal basis");
         sample_rows(problem, &mut self.phi);
         self.point.reset(problem);
         self.point.place(problem);
         evaluate(&mut self.point, problem, &self.phi);
+        if let Some(Guess { beta, xi, below }) = guess {
+            self.trial.clone_from(&self.point);
+            self.trial.beta.copy_from_slice(beta);
+            self.trial.xi.copy_from_slice(xi);
+            self.trial.place(problem);
+            evaluate(&mut self.trial, problem, &self.phi);
+            if self.trial.objective(problem) < below {
+                std::mem::swap(&mut self.point, &mut self.trial);
+            }
+        }
 
         let mut account = Account::default();
-        self.stuck_at = f64::INFINITY;
+        (self.stuck_at, self.stalls) = (f64::INFINITY, 0);
         while account.iterations < problem.stopping.max_iterations {
             account.iterations += 1;
             self.linearise(problem);
@@ -228,13 +266,20 @@ impl CollocationSolver {
             }
             share *= 0.5;
         }
-        // The far side of a corner may lead on, so that one such step is taken; and another, if it did.
-        if !better {
-            let promised = self.promised(problem) < (1.0 - PROGRESS) * before;
-            if promised && before > (1.0 - PROGRESS) * self.stuck_at {
+        // The far side of a corner may lead on, so that such a step is taken; and another, if it did.
+        let promised = before - self.promised(problem);
+        let kept = before - self.trial.objective(problem);
+        if share < 0.75 && promised > PROGRESS * before && kept < LEAST_KEPT * promised {
+            if before <= (1.0 - PROGRESS) * self.stuck_at {
+                (self.stuck_at, self.stalls) = (before, 0);
+            }
+            self.stalls += 1;
+            if self.stalls > MAX_STALLS {
+                if better {
+                    std::mem::swap(&mut self.point, &mut self.trial);
+                }
                 return Step::Corner;
             }
-            self.stuck_at = before;
         }
         // A limited step is no minimiser, however well it was predicted.
         let converged = !self.limited && share > 0.75 && self.agrees(problem, share);

@@ -1,5 +1,7 @@
 #![doc = include_str!("sweeps.md")]
 
+use arrayvec::ArrayVec;
+
 use super::basis::Basis;
 use super::problem::Unknowns;
 use crate::model::Transform;
@@ -10,9 +12,6 @@ pub const MAX_SWEEPS: usize = 20;
 
 /// The same, where there are samples.
 pub const MAX_ROUNDS: usize = 14;
-
-/// Up to this many nodes there is code with less to clear away.
-const FEW: usize = 5;
 
 /// Most nodes of a batch.
 const MAX_NODES: usize = 8;
@@ -51,6 +50,62 @@ impl Expressions {
             end: (0..nodes).map(|k| lanes(&|basis| basis.end()[k])).collect(),
             length_s: first.length_s(),
         })
+    }
+}
+
+/// What the members of an ensemble have in common in a window: the equations, all parameters but their own, and, unless
+/// these set the clock, what depends on the time only.
+#[derive(Clone)]
+pub struct Shared<M: LaneModel> {
+    model: M,
+    fixed: M::Fixed,
+    /// Parameters of which members have values of their own.
+    own: Vec<usize>,
+    /// At these nodes \[s\], and at the end of the window; None where each has its own.
+    times_s: Vec<f64>,
+    moments: Option<(AtNodes<M::Moment>, M::Moment)>,
+    length_s: f64,
+}
+
+impl<M: LaneModel> std::fmt::Debug for Shared<M> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Shared").field("model", &self.model).field("own", &self.own).finish_non_exhaustive()
+    }
+}
+
+impl<M: LaneModel> Shared<M> {
+    /// From the parameters of any eight members, `[n_parameters]`, of which they may differ in `own`; None where `model`
+    /// has no equations for these, or does not know what their own parameters do.
+    #[must_use]
+    pub fn new(model: M, theta: &[Lanes], own: &[usize]) -> Option<Self> {
+        if !own.iter().all(|&p| model.knows(p)) {
+            return None;
+        }
+        let fixed = model.fixed(theta)?;
+        Some(Self { model, fixed, own: own.to_vec(), times_s: Vec::new(), moments: None, length_s: 0.0 })
+    }
+
+    /// The equations.
+    #[must_use]
+    pub fn model(&self) -> &M {
+        &self.model
+    }
+
+    /// Another window begins: parameters that all have alike, `moved`, are now those in `theta`.
+    pub fn begin(&mut self, theta: &[Lanes], moved: &[usize], expressions: &Expressions, instructions: InstructionSet) {
+        for &p in moved.iter().filter(|p| !self.own.contains(p)) {
+            self.model.change(&mut self.fixed, theta, p);
+        }
+        if self.own.iter().any(|&p| M::is_timed(p)) {
+            return;
+        }
+        self.times_s.clone_from(&expressions.times_s);
+        self.length_s = expressions.length_s;
+        self.moments = Some(instructions.run(Moments::<M> {
+            fixed: &self.fixed,
+            times_s: &self.times_s,
+            length_s: self.length_s,
+        }));
     }
 }
 
@@ -98,6 +153,18 @@ impl<'a> Samples<'a> {
     fn phi(&self, sample: usize) -> &'a [Lanes] {
         let nodes = self.phi.len() / self.states.len();
         &self.phi[sample * nodes..(sample + 1) * nodes]
+    }
+
+    /// One of them.
+    #[inline(always)]
+    fn only(&self, sample: usize) -> Self {
+        let one = sample..sample + 1;
+        Self {
+            states: &self.states[one.clone()],
+            weights: &self.weights[one.clone()],
+            phi: self.phi(sample),
+            values: &self.values[one],
+        }
     }
 }
 
@@ -147,6 +214,8 @@ pub struct Freedom<'a> {
 pub struct FitScratch {
     /// Weighted residuals that the dual equations are driven by, and how far they are from those found, `[n_samples]`.
     residuals: Vec<Lanes>,
+    /// `weight * residual`
+    pulls: Vec<Lanes>,
     off: Vec<Lanes>,
     step: Vec<Lanes>,
     along: Vec<Lanes>,
@@ -159,105 +228,151 @@ pub struct FitScratch {
     mean_theta: Vec<Lanes>,
 }
 
-/// A window without samples: sweeps until no equation is off by more than `tolerance_mmhg` over its length. None, with
-/// nothing done, where `model` has no equations for these members.
+/// A window without samples: sweeps until no equation is off by more than `tolerance_mmhg` over its length.
 #[must_use]
 pub fn forecast<M: LaneModel>(
-    model: &M,
+    shared: &Shared<M>,
     expressions: &Expressions,
     tolerance_mmhg: f64,
     instructions: InstructionSet,
     solutions: &mut Solutions,
-) -> Option<Progress> {
+) -> Progress {
     let nodes = expressions.times_s.len();
     solutions.beta.resize(nodes * solutions.start.len(), Lanes::default());
     solutions.end.resize(solutions.start.len(), Lanes::default());
     let limit = tolerance_mmhg / expressions.length_s;
-    if nodes <= FEW {
-        instructions.run(Forecast::<M, FEW> { model, expressions, limit, solutions })
-    } else {
-        instructions.run(Forecast::<M, MAX_NODES> { model, expressions, limit, solutions })
-    }
+    instructions.run(Forecast { shared, expressions, limit, solutions })
 }
 
-/// A window with samples, from the solution without them (by [`forecast`]). None, with nothing done, where `model` does
-/// not know what is free.
+/// A window with samples, from the solution without them (by [`forecast`]). What is free is among the members' own
+/// parameters.
 #[must_use]
 pub fn fit<M: LaneModel>(
-    model: &M,
+    shared: &Shared<M>,
     expressions: &Expressions,
     samples: &Samples<'_>,
     freedom: &Freedom<'_>,
     tolerance_mmhg: f64,
     instructions: InstructionSet,
     (scratch, solutions): (&mut FitScratch, &mut Solutions),
-) -> Option<Progress> {
-    if !freedom.unknowns.parameters.iter().all(|&p| model.knows(p)) {
-        return None;
+) -> Progress {
+    instructions.run(Fit { shared, expressions, samples, freedom, tolerance_mmhg, scratch, solutions })
+}
+
+/// Derived quantities of the states `x` at `t_s` after the start of the window, `[n_derived]`.
+pub fn derive<M: LaneModel>(
+    shared: &Shared<M>,
+    t_s: f64,
+    instructions: InstructionSet,
+    (x, theta): (&[Lanes], &[Lanes]),
+    out: &mut [Lanes],
+) {
+    instructions.run(Derive { shared, t_s, x, theta, out });
+}
+
+#[allow(clippy::inline_always)]
+impl<M: LaneModel> Shared<M> {
+    /// With what these members have of their own.
+    #[inline(always)]
+    fn fixed_of(&self, theta: &[Lanes]) -> M::Fixed {
+        let mut fixed = self.fixed;
+        for &p in &self.own {
+            self.model.change(&mut fixed, theta, p);
+        }
+        fixed
     }
-    if expressions.times_s.len() <= FEW {
-        instructions.run(Fit::<M, FEW> { model, expressions, samples, freedom, tolerance_mmhg, scratch, solutions })
-    } else {
-        instructions.run(Fit::<M, MAX_NODES> {
-            model,
-            expressions,
-            samples,
-            freedom,
-            tolerance_mmhg,
-            scratch,
-            solutions,
-        })
+
+    #[inline(always)]
+    fn moment_of(&self, fixed: &M::Fixed, t_s: f64) -> M::Moment {
+        match &self.moments {
+            Some((_, end)) if t_s.to_bits() == self.length_s.to_bits() => *end,
+            _ => M::moment(fixed, &M::instant(fixed, t_s)),
+        }
     }
 }
 
-/// Something at every node. Lent, not owned, by what is made of it: these are too large to be moved about.
-type AtNodes<T, const N: usize> = [T; N];
+/// Something at every node, written once it is known: clearing these first would take a tenth of a forecast. Lent, not
+/// owned, by what is made of them: they are too large to be moved about.
+type AtNodes<T> = ArrayVec<T, MAX_NODES>;
 
 /// The equations of a model at the nodes of a window.
-struct Equations<'a, M: LaneModel, const N: usize> {
+struct Equations<'a, M: LaneModel> {
     fixed: M::Fixed,
-    moments: &'a mut AtNodes<M::Moment, N>,
+    moments: &'a mut AtNodes<M::Moment>,
     /// Kept where derivatives by parameters are needed.
-    instants: Option<&'a mut AtNodes<M::Instant, N>>,
+    instants: Option<&'a mut AtNodes<M::Instant>>,
     expressions: &'a Expressions,
 }
 
 /// The path of the members: slopes and states at the nodes.
-struct Path<'a, M: LaneModel, const N: usize> {
+struct Path<'a, M: LaneModel> {
     start: M::State,
-    slopes: &'a mut AtNodes<M::State, N>,
+    slopes: &'a mut AtNodes<M::State>,
 }
 
 /// The derivatives where the equations were evaluated last, and relaxations that fit them well enough.
-struct Tangents<'a, M: LaneModel, const N: usize> {
-    tangents: &'a mut AtNodes<M::Tangent, N>,
-    relaxations: &'a mut AtNodes<M::Relaxation, N>,
+struct Tangents<'a, M: LaneModel> {
+    tangents: &'a mut AtNodes<M::Tangent>,
+    relaxations: &'a mut AtNodes<M::Relaxation>,
 }
 
-/// The dual path: `g = (I - df/dx phi)^-T b`, and `(df/dx)^T g`.
-struct Dual<'a, M: LaneModel, const N: usize> {
-    g: &'a mut AtNodes<M::State, N>,
-    pulled: &'a mut AtNodes<M::State, N>,
+/// The errors of the equations that a dual path stands for, `e = -g / w^2`.
+struct Errors<'a, M: LaneModel> {
+    g: &'a AtNodes<M::State>,
+    /// `-1 / w^2`
+    factors: &'a M::State,
 }
 
 #[allow(clippy::inline_always)]
-impl<'a, M: LaneModel, const N: usize> Equations<'a, M, N> {
+impl<M: LaneModel> Errors<'_, M> {
+    #[inline(always)]
+    fn add_to(&self, residual: &mut M::State, node: usize) {
+        for ((to, g), factor) in residual.as_mut().iter_mut().zip(self.g[node].as_ref()).zip(self.factors.as_ref()) {
+            *to = *to + *g * *factor;
+        }
+    }
+
+    /// Sum of their squares.
+    #[inline(always)]
+    fn squares(&self) -> Lanes {
+        let mut squares = Lanes::default();
+        for g in self.g {
+            for (g, factor) in g.as_ref().iter().zip(self.factors.as_ref()) {
+                let error = *g * *factor;
+                squares = squares + error * error;
+            }
+        }
+        squares
+    }
+}
+
+/// The dual path: `g = (I - df/dx phi)^-T b`, and `(df/dx)^T g`.
+struct Dual<'a, M: LaneModel> {
+    g: &'a mut AtNodes<M::State>,
+    pulled: &'a mut AtNodes<M::State>,
+}
+
+#[allow(clippy::inline_always)]
+impl<'a, M: LaneModel> Equations<'a, M> {
     #[inline(always)]
     fn new(
-        model: &M,
+        shared: &Shared<M>,
         expressions: &'a Expressions,
         theta: &[Lanes],
-        moments: &'a mut AtNodes<M::Moment, N>,
-        instants: Option<&'a mut AtNodes<M::Instant, N>>,
-    ) -> Option<Self> {
-        let mut equations = Self { fixed: model.fixed(theta)?, moments, instants, expressions };
-        equations.set_moments();
-        Some(equations)
+        moments: &'a mut AtNodes<M::Moment>,
+        instants: Option<&'a mut AtNodes<M::Instant>>,
+    ) -> Self {
+        let mut equations = Self { fixed: shared.fixed_of(theta), moments, instants, expressions };
+        match &shared.moments {
+            Some((moments, _)) if shared.times_s == expressions.times_s => equations.moments.clone_from(moments),
+            _ => equations.set_moments(),
+        }
+        equations
     }
 
     #[inline(always)]
     fn nodes(&self) -> usize {
-        self.expressions.times_s.len().min(N)
+        self.expressions.times_s.len()
     }
 
     /// `phi` at a node, `[n_nodes]`.
@@ -268,21 +383,25 @@ impl<'a, M: LaneModel, const N: usize> Equations<'a, M, N> {
 
     #[inline(always)]
     fn set_moments(&mut self) {
-        for (node, (moment, t_s)) in self.moments.iter_mut().zip(&self.expressions.times_s).enumerate() {
+        self.moments.clear();
+        if let Some(instants) = &mut self.instants {
+            instants.clear();
+        }
+        for t_s in &self.expressions.times_s {
             let instant = M::instant(&self.fixed, *t_s);
-            *moment = M::moment(&self.fixed, &instant);
+            self.moments.push(M::moment(&self.fixed, &instant));
             if let Some(instants) = &mut self.instants {
-                instants[node] = instant;
+                instants.push(instant);
             }
         }
     }
 
     /// Derivatives at the start of the window, for all nodes.
     #[inline(always)]
-    fn look_ahead(&self, tangent: M::Tangent, at: &mut Tangents<'_, M, N>) {
-        for node in 0..self.nodes() {
-            at.tangents[node] = tangent;
-            at.relaxations[node] = M::relaxation(&self.fixed, &self.moments[node], &tangent, self.phi(node)[node]);
+    fn look_ahead(&self, tangent: M::Tangent, at: &mut Tangents<'_, M>) {
+        for (node, moment) in self.moments.iter().enumerate() {
+            at.tangents.push(tangent);
+            at.relaxations.push(M::relaxation(&self.fixed, moment, &tangent, self.phi(node)[node]));
         }
     }
 
@@ -291,12 +410,15 @@ impl<'a, M: LaneModel, const N: usize> Equations<'a, M, N> {
     #[inline(always)]
     fn sweep(
         &self,
-        path: &mut Path<'_, M, N>,
-        at: &mut Tangents<'_, M, N>,
-        errors: Option<&AtNodes<M::State, N>>,
-        mut states: Option<&mut AtNodes<M::State, N>>,
+        path: &mut Path<'_, M>,
+        at: &mut Tangents<'_, M>,
+        errors: Option<&Errors<'_, M>>,
+        mut states: Option<&mut AtNodes<M::State>>,
     ) -> Lanes {
         let mut largest = Lanes::splat(0.0);
+        if let Some(states) = &mut states {
+            states.clear();
+        }
         for node in 0..self.nodes() {
             let phi = self.phi(node);
             let x = path.at(phi);
@@ -305,7 +427,7 @@ impl<'a, M: LaneModel, const N: usize> Equations<'a, M, N> {
                 *r = *r - *k;
             }
             if let Some(errors) = errors {
-                add::<M>(&mut residual, &errors[node]);
+                errors.add_to(&mut residual, node);
             }
             for r in residual.as_ref() {
                 largest = r.abs().larger(largest);
@@ -318,18 +440,33 @@ impl<'a, M: LaneModel, const N: usize> Equations<'a, M, N> {
                 at.tangents[node] = tangent;
             }
             if let Some(states) = &mut states {
-                states[node] = x;
+                states.push(x);
             }
         }
         largest
     }
 
-    /// The same for the dual equations, which run backwards.
+    /// The same for the dual equations, which run backwards, driven by what the samples pull at; the largest residual and
+    /// the largest of what drives them.
     #[inline(always)]
-    fn sweep_dual(&self, at: &Tangents<'_, M, N>, drive: &AtNodes<M::State, N>, dual: &mut Dual<'_, M, N>) -> Lanes {
-        let mut largest = Lanes::splat(0.0);
+    fn sweep_dual(
+        &self,
+        at: &Tangents<'_, M>,
+        (samples, pulls): (&Samples<'_>, &[Lanes]),
+        dual: &mut Dual<'_, M>,
+    ) -> (Lanes, Lanes) {
+        let (mut largest, mut size) = (Lanes::splat(0.0), Lanes::splat(0.0));
         for node in (0..self.nodes()).rev() {
-            let mut residual = drive[node];
+            let mut residual = M::State::default();
+            // State by state: by the index of the observed one, these would have to go through memory.
+            for (i, entry) in residual.as_mut().iter_mut().enumerate() {
+                for (j, pull) in pulls.iter().enumerate() {
+                    if samples.states[j] == i {
+                        *entry = *entry + *pull * samples.phi[j * self.nodes() + node];
+                        size = entry.abs().larger(size);
+                    }
+                }
+            }
             let column = self.expressions.values[node..].iter().step_by(self.nodes());
             for (phi, pulled) in column.zip(dual.pulled.iter()) {
                 for (r, pulled) in residual.as_mut().iter_mut().zip(pulled.as_ref()) {
@@ -346,23 +483,37 @@ impl<'a, M: LaneModel, const N: usize> Equations<'a, M, N> {
             add::<M>(&mut dual.g[node], &step);
             dual.pulled[node] = M::pull(&self.fixed, &self.moments[node], &at.tangents[node], &dual.g[node]);
         }
-        largest
+        (largest, size)
     }
 }
 
 #[allow(clippy::inline_always)]
-impl<'a, M: LaneModel, const N: usize> Path<'a, M, N> {
+impl<M: LaneModel> Dual<'_, M> {
+    /// Where nothing pulls.
+    #[inline(always)]
+    fn rest(&mut self, nodes: usize) {
+        for at_nodes in [&mut *self.g, &mut *self.pulled] {
+            at_nodes.clear();
+            for _ in 0..nodes {
+                at_nodes.push(M::State::default());
+            }
+        }
+    }
+}
+
+#[allow(clippy::inline_always)]
+impl<'a, M: LaneModel> Path<'a, M> {
     /// Slopes constant over the window; the derivative at its start.
     #[inline(always)]
     fn straight(
-        equations: &Equations<'_, M, N>,
+        equations: &Equations<'_, M>,
         start: &[Lanes],
-        slopes: &'a mut AtNodes<M::State, N>,
+        slopes: &'a mut AtNodes<M::State>,
     ) -> (Self, M::Tangent) {
         let start = state::<M>(start);
         let (slope, tangent) = M::linearise(&equations.fixed, &equations.moments[0], &start);
-        for slopes in &mut slopes[..equations.nodes()] {
-            *slopes = slope;
+        for _ in 0..equations.nodes() {
+            slopes.push(slope);
         }
         (Self { start, slopes }, tangent)
     }
@@ -390,7 +541,7 @@ impl<'a, M: LaneModel, const N: usize> Path<'a, M, N> {
     }
 
     #[inline(always)]
-    fn write(&self, equations: &Equations<'_, M, N>, solutions: &mut Solutions) {
+    fn write(&self, equations: &Equations<'_, M>, solutions: &mut Solutions) {
         solutions.start.copy_from_slice(self.start.as_ref());
         solutions.end.copy_from_slice(self.at(&equations.expressions.end).as_ref());
         for (i, beta) in solutions.beta.chunks_exact_mut(equations.nodes()).enumerate() {
@@ -465,25 +616,66 @@ impl Left {
     }
 }
 
-struct Forecast<'a, M, const N: usize> {
-    model: &'a M,
+struct Moments<'a, M: LaneModel> {
+    fixed: &'a M::Fixed,
+    times_s: &'a [f64],
+    length_s: f64,
+}
+
+#[allow(clippy::inline_always)]
+impl<M: LaneModel> pulp::NullaryFnOnce for Moments<'_, M> {
+    type Output = (AtNodes<M::Moment>, M::Moment);
+
+    #[inline(always)]
+    fn call(self) -> Self::Output {
+        let mut moments = AtNodes::new();
+        for t_s in self.times_s {
+            moments.push(M::moment(self.fixed, &M::instant(self.fixed, *t_s)));
+        }
+        (moments, M::moment(self.fixed, &M::instant(self.fixed, self.length_s)))
+    }
+}
+
+struct Derive<'a, M: LaneModel> {
+    shared: &'a Shared<M>,
+    t_s: f64,
+    x: &'a [Lanes],
+    theta: &'a [Lanes],
+    out: &'a mut [Lanes],
+}
+
+#[allow(clippy::inline_always)]
+impl<M: LaneModel> pulp::NullaryFnOnce for Derive<'_, M> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        let Self { shared, t_s, x, theta, out } = self;
+        let fixed = shared.fixed_of(theta);
+        let moment = shared.moment_of(&fixed, t_s);
+        M::derive((&fixed, &moment), &state::<M>(x), theta, out);
+    }
+}
+
+struct Forecast<'a, M: LaneModel> {
+    shared: &'a Shared<M>,
     expressions: &'a Expressions,
     limit: f64,
     solutions: &'a mut Solutions,
 }
 
 #[allow(clippy::inline_always)]
-impl<M: LaneModel, const N: usize> pulp::NullaryFnOnce for Forecast<'_, M, N> {
-    type Output = Option<Progress>;
+impl<M: LaneModel> pulp::NullaryFnOnce for Forecast<'_, M> {
+    type Output = Progress;
 
     #[inline(always)]
-    fn call(self) -> Self::Output {
-        let Self { model, expressions, limit, solutions } = self;
-        let (mut moments, mut slopes) = ([M::Moment::default(); N], [M::State::default(); N]);
-        let equations = Equations::<M, N>::new(model, expressions, &solutions.theta, &mut moments, None)?;
+    fn call(self) -> Progress {
+        let Self { shared, expressions, limit, solutions } = self;
+        let (mut moments, mut slopes) = (AtNodes::new(), AtNodes::new());
+        let equations = Equations::<M>::new(shared, expressions, &solutions.theta, &mut moments, None);
         let (mut path, tangent) = Path::straight(&equations, &solutions.start, &mut slopes);
-        let (mut tangents, mut relaxations) = ([M::Tangent::default(); N], [M::Relaxation::default(); N]);
-        let mut at = Tangents::<M, N> { tangents: &mut tangents, relaxations: &mut relaxations };
+        let (mut tangents, mut relaxations) = (AtNodes::new(), AtNodes::new());
+        let mut at = Tangents::<M> { tangents: &mut tangents, relaxations: &mut relaxations };
         equations.look_ahead(tangent, &mut at);
         let (mut left, mut sweeps) = (Left::START, 0);
         while sweeps < MAX_SWEEPS {
@@ -497,12 +689,12 @@ impl<M: LaneModel, const N: usize> pulp::NullaryFnOnce for Forecast<'_, M, N> {
         let physics_rms = left.of_limit * Lanes::splat(limit);
         let mut done = left.of_limit.0.map(|share| share <= 1.0);
         refuse_what_is_no_number(&solutions.end, &mut done);
-        Some(Progress { sweeps, done, physics_rms })
+        Progress { sweeps, done, physics_rms }
     }
 }
 
-struct Fit<'a, M, const N: usize> {
-    model: &'a M,
+struct Fit<'a, M: LaneModel> {
+    shared: &'a Shared<M>,
     expressions: &'a Expressions,
     samples: &'a Samples<'a>,
     freedom: &'a Freedom<'a>,
@@ -512,40 +704,43 @@ struct Fit<'a, M, const N: usize> {
 }
 
 #[allow(clippy::inline_always)]
-impl<M: LaneModel, const N: usize> pulp::NullaryFnOnce for Fit<'_, M, N> {
-    type Output = Option<Progress>;
+impl<M: LaneModel> pulp::NullaryFnOnce for Fit<'_, M> {
+    type Output = Progress;
 
     #[inline(always)]
-    fn call(self) -> Self::Output {
-        let Self { model, expressions, samples, freedom, tolerance_mmhg, scratch, solutions } = self;
-        let (mut moments, mut slopes) = ([M::Moment::default(); N], [M::State::default(); N]);
-        let mut instants = [M::Instant::default(); N];
-        let mut equations =
-            Equations::<M, N>::new(model, expressions, &solutions.theta, &mut moments, Some(&mut instants))?;
+    fn call(self) -> Progress {
+        let Self { shared, expressions, samples, freedom, tolerance_mmhg, scratch, solutions } = self;
+        let (mut moments, mut instants) = (AtNodes::new(), AtNodes::new());
+        let timed = freedom.unknowns.parameters.iter().any(|&p| M::is_timed(p));
+        let kept = timed.then_some(&mut instants);
+        let model = &shared.model;
+        let mut equations = Equations::<M>::new(shared, expressions, &solutions.theta, &mut moments, kept);
         let nodes = equations.nodes();
         let mean = state::<M>(&solutions.start);
-        let mut path = Path::<M, N> { start: mean, slopes: &mut slopes };
-        for (i, beta) in solutions.beta.chunks_exact(nodes).enumerate() {
-            for (beta, slopes) in beta.iter().zip(path.slopes.iter_mut()) {
-                slopes.as_mut()[i] = *beta;
+        let mut slopes = AtNodes::new();
+        for node in 0..nodes {
+            let mut slope = M::State::default();
+            for (slope, beta) in slope.as_mut().iter_mut().zip(solutions.beta.chunks_exact(nodes)) {
+                *slope = beta[node];
             }
+            slopes.push(slope);
         }
+        let mut path = Path::<M> { start: mean, slopes: &mut slopes };
         // Derivatives where the members are; the residual is that of the forecast.
-        let (mut tangents, mut relaxations) = ([M::Tangent::default(); N], [M::Relaxation::default(); N]);
-        let mut at = Tangents::<M, N> { tangents: &mut tangents, relaxations: &mut relaxations };
+        let (mut tangents, mut relaxations) = (AtNodes::new(), AtNodes::new());
+        let mut at = Tangents::<M> { tangents: &mut tangents, relaxations: &mut relaxations };
         let (_, tangent) = M::linearise(&equations.fixed, &equations.moments[0], &path.start);
         equations.look_ahead(tangent, &mut at);
-        let mut states = [M::State::default(); N];
+        let mut states = AtNodes::new();
         equations.sweep(&mut path, &mut at, None, Some(&mut states));
 
         scratch.begin(samples, freedom, &path, &solutions.theta);
-        let (mut g, mut pulled) = ([M::State::default(); N], [M::State::default(); N]);
-        let mut dual = Dual::<M, N> { g: &mut g, pulled: &mut pulled };
-        let (mut drive, mut errors) = ([M::State::default(); N], [M::State::default(); N]);
+        let (mut g, mut pulled) = (AtNodes::new(), AtNodes::new());
+        let mut dual = Dual::<M> { g: &mut g, pulled: &mut pulled };
         if freedom.precision.is_none() {
-            let (work, known) = ((&mut dual, &mut drive), (&at, &states));
-            scratch.guess(model, &equations, samples, freedom, work, known, &solutions.theta);
+            scratch.guess(model, &equations, samples, freedom, (&mut dual, &at), &states, &solutions.theta);
         }
+        dual.rest(nodes);
         scratch.advance();
         let mut progress = Progress { sweeps: 0, done: [false; WIDTH], physics_rms: Lanes::default() };
         let mut of_dual = M::State::default();
@@ -557,32 +752,23 @@ impl<M: LaneModel, const N: usize> pulp::NullaryFnOnce for Fit<'_, M, N> {
         while progress.sweeps < MAX_ROUNDS {
             progress.sweeps += 1;
             // What the samples pull at, and how that feels at the nodes.
-            drive[..nodes].fill(M::State::default());
-            let mut size = Lanes::default();
-            for (j, &observed) in samples.states.iter().enumerate() {
-                let pull = Lanes::splat(samples.weights[j]) * scratch.residuals[j];
-                for (drive, phi) in drive[..nodes].iter_mut().zip(samples.phi(j)) {
-                    let entry = &mut drive.as_mut()[observed];
-                    *entry = *entry + pull * *phi;
-                    size = entry.abs().larger(size);
-                }
+            for (pull, (weight, residual)) in
+                scratch.pulls.iter_mut().zip(samples.weights.iter().zip(&scratch.residuals))
+            {
+                *pull = Lanes::splat(*weight) * *residual;
             }
-            let dual_residual = equations.sweep_dual(&at, &drive, &mut dual);
+            let (dual_residual, size) = equations.sweep_dual(&at, (samples, &scratch.pulls), &mut dual);
             // Relative to what drives it: corrections are of the order of a mmHg. Where nothing pulls, nothing is left.
             let least = Lanes::splat(f64::MIN_POSITIVE);
             dual_left.after(dual_residual, (size * Lanes::splat(tolerance_mmhg)).larger(least));
 
-            // Errors of the equations, states at the start and parameters follow from that.
-            for (error, g) in errors[..nodes].iter_mut().zip(dual.g.iter()) {
-                for ((error, g), factor) in error.as_mut().iter_mut().zip(g.as_ref()).zip(of_dual.as_ref()) {
-                    *error = *g * *factor;
-                }
-            }
+            // States at the start and parameters follow from that, and the path that belongs to them.
             let within =
                 scratch.place(model, &mut equations, samples, freedom, (&dual, &states), (mean, &mut path), solutions);
-
-            // The path that belongs to them, and what it makes of the samples.
+            let errors = Errors { g: &*dual.g, factors: &of_dual };
             let residual = equations.sweep(&mut path, &mut at, Some(&errors), Some(&mut states));
+
+            // What it makes of the samples.
             let mut off = Lanes::default();
             for (j, &observed) in samples.states.iter().enumerate() {
                 let weight = Lanes::splat(samples.weights[j]);
@@ -600,27 +786,24 @@ impl<M: LaneModel, const N: usize> pulp::NullaryFnOnce for Fit<'_, M, N> {
             }
             scratch.improve();
         }
-        let mut squares = Lanes::default();
-        for error in &errors[..nodes] {
-            squares = squares + dot(error.as_ref(), error.as_ref());
-        }
         #[allow(clippy::cast_precision_loss)]
         let count = (nodes * solutions.start.len()) as f64;
-        progress.physics_rms = (squares / Lanes::splat(count)).sqrt();
+        let errors = Errors::<M> { g: &*dual.g, factors: &of_dual };
+        progress.physics_rms = (errors.squares() / Lanes::splat(count)).sqrt();
         path.write(&equations, solutions);
         refuse_what_is_no_number(&solutions.end, &mut progress.done);
-        Some(progress)
+        progress
     }
 }
 
 /// `B^T g`: what the dual path says of the state at the start and the parameters, `[n_u]`.
 #[allow(clippy::inline_always)]
 #[inline(always)]
-fn pull_back<M: LaneModel, const N: usize>(
+fn pull_back<M: LaneModel>(
     model: &M,
-    equations: &Equations<'_, M, N>,
+    equations: &Equations<'_, M>,
     freedom: &Freedom<'_>,
-    (dual, states): (&Dual<'_, M, N>, &AtNodes<M::State, N>),
+    (dual, states): (&Dual<'_, M>, &AtNodes<M::State>),
     theta: &[Lanes],
     out: &mut [Lanes],
 ) {
@@ -628,7 +811,7 @@ fn pull_back<M: LaneModel, const N: usize>(
     let mut first = 0;
     if unknowns.initial_state {
         let mut sum = M::State::default();
-        for pulled in &dual.pulled[..equations.nodes()] {
+        for pulled in &*dual.pulled {
             add::<M>(&mut sum, pulled);
         }
         first = sum.as_ref().len();
@@ -637,7 +820,7 @@ fn pull_back<M: LaneModel, const N: usize>(
     for (k, (&p, transform)) in unknowns.parameters.iter().zip(&unknowns.transforms).enumerate() {
         let timed = M::is_timed(p);
         let mut sum = Lanes::default();
-        for (node, (x, g)) in states[..equations.nodes()].iter().zip(dual.g.iter()).enumerate() {
+        for (node, (x, g)) in states.iter().zip(dual.g.iter()).enumerate() {
             let mut by = None;
             if let Some(instants) = equations.instants.as_ref().filter(|_| timed) {
                 let at = (equations.expressions.times_s[node], &instants[node]);
@@ -655,37 +838,44 @@ fn pull_back<M: LaneModel, const N: usize>(
 /// Sweeps through the dual equations that are good enough for a guess.
 const GUESS_SWEEPS: usize = 2;
 
+impl FitScratch {
+    /// Where the last fit left the whitened unknowns of a member, from the root of its prior covariance,
+    /// `[n_u x n_xi]`, row-major: `xi = -root^T gradient`.
+    pub fn xi(&self, lane: usize, root: &[f64], n_xi: usize, out: &mut Vec<f64>) {
+        out.clear();
+        out.resize(n_xi, 0.0);
+        for (gradient, row) in self.gradient.iter().zip(root.chunks_exact(n_xi)) {
+            out.iter_mut().zip(row).for_each(|(xi, root)| *xi -= root * gradient.0[lane]);
+        }
+    }
+}
+
 #[allow(clippy::inline_always)]
 impl FitScratch {
     /// Works out the inverse covariance of the weighted samples, `S = 1 + H P H^T + G G^T / w^2`.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
-    fn guess<M: LaneModel, const N: usize>(
+    fn guess<M: LaneModel>(
         &mut self,
         model: &M,
-        equations: &Equations<'_, M, N>,
+        equations: &Equations<'_, M>,
         samples: &Samples<'_>,
         freedom: &Freedom<'_>,
-        (dual, drive): (&mut Dual<'_, M, N>, &mut AtNodes<M::State, N>),
-        (at, states): (&Tangents<'_, M, N>, &AtNodes<M::State, N>),
+        (dual, at): (&mut Dual<'_, M>, &Tangents<'_, M>),
+        states: &AtNodes<M::State>,
         theta: &[Lanes],
     ) {
         let (m, n_u, nodes) = (samples.states.len(), self.gradient.len(), equations.nodes());
-        let n = drive[0].as_ref().len();
+        let n = states[0].as_ref().len();
         self.answers.clear();
         self.answers.resize(m * (n_u + nodes * n), Lanes::default());
         let mut answers = std::mem::take(&mut self.answers);
         for (j, answer) in answers.chunks_exact_mut(n_u + nodes * n).enumerate() {
             let observed = samples.states[j];
             let weight = Lanes::splat(samples.weights[j]);
-            drive[..nodes].fill(M::State::default());
-            dual.g[..nodes].fill(M::State::default());
-            dual.pulled[..nodes].fill(M::State::default());
-            for (drive, phi) in drive[..nodes].iter_mut().zip(samples.phi(j)) {
-                drive.as_mut()[observed] = weight * *phi;
-            }
+            dual.rest(nodes);
             for _ in 0..GUESS_SWEEPS {
-                equations.sweep_dual(at, drive, dual);
+                equations.sweep_dual(at, (&samples.only(j), &[weight]), dual);
             }
             let (of_u, of_errors) = answer.split_at_mut(n_u);
             pull_back(model, equations, freedom, (dual, states), theta, of_u);
@@ -709,8 +899,6 @@ impl FitScratch {
         }
         self.answers = answers;
         self.invert(m);
-        dual.g[..nodes].fill(M::State::default());
-        dual.pulled[..nodes].fill(M::State::default());
     }
 
     /// Gauss-Jordan in place; the matrix is the identity plus a Gram matrix, so that pivots are 1 or more.
@@ -737,17 +925,17 @@ impl FitScratch {
 
     /// Where the members are without the samples.
     #[inline(always)]
-    fn begin<M: LaneModel, const N: usize>(
+    fn begin<M: LaneModel>(
         &mut self,
         samples: &Samples<'_>,
         freedom: &Freedom<'_>,
-        path: &Path<'_, M, N>,
+        path: &Path<'_, M>,
         theta: &[Lanes],
     ) {
         let m = samples.states.len();
         self.mean_theta.clear();
         self.mean_theta.extend_from_slice(theta);
-        for rows in [&mut self.residuals, &mut self.off, &mut self.step, &mut self.along] {
+        for rows in [&mut self.residuals, &mut self.pulls, &mut self.off, &mut self.step, &mut self.along] {
             rows.clear();
             rows.resize(m, Lanes::default());
         }
@@ -807,14 +995,14 @@ impl FitScratch {
     /// where no coordinate moved further than its limit.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
-    fn place<M: LaneModel, const N: usize>(
+    fn place<M: LaneModel>(
         &mut self,
         model: &M,
-        equations: &mut Equations<'_, M, N>,
+        equations: &mut Equations<'_, M>,
         samples: &Samples<'_>,
         freedom: &Freedom<'_>,
-        (dual, states): (&Dual<'_, M, N>, &AtNodes<M::State, N>),
-        (mean, path): (M::State, &mut Path<'_, M, N>),
+        (dual, states): (&Dual<'_, M>, &AtNodes<M::State>),
+        (mean, path): (M::State, &mut Path<'_, M>),
         solutions: &mut Solutions,
     ) -> Lanes {
         let unknowns = freedom.unknowns;
@@ -822,9 +1010,8 @@ impl FitScratch {
         let mut gradient = std::mem::take(&mut self.gradient);
         pull_back(model, equations, freedom, (dual, states), &solutions.theta, &mut gradient);
         if unknowns.initial_state {
-            for (j, &observed) in samples.states.iter().enumerate() {
-                let pull = Lanes::splat(samples.weights[j]) * self.residuals[j];
-                gradient[observed] = gradient[observed] + pull;
+            for (&observed, pull) in samples.states.iter().zip(&self.pulls) {
+                gradient[observed] = gradient[observed] + *pull;
             }
         }
         self.gradient = gradient;

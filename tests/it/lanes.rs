@@ -15,7 +15,9 @@ use hemostream::xtfc::basis::Basis;
 use hemostream::xtfc::collocation::CollocationSolver;
 use hemostream::xtfc::features::{FeatureSpec, RandomFeatures};
 use hemostream::xtfc::problem::{Datum, Prior, Solution, Stopping, Unknowns, WindowProblem};
-use hemostream::xtfc::sweeps::{Covariance, Expressions, FitScratch, Freedom, Samples, Solutions, fit, forecast};
+use hemostream::xtfc::sweeps::{
+    Covariance, Expressions, FitScratch, Freedom, Samples, Shared, Solutions, derive, fit, forecast,
+};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -94,6 +96,13 @@ impl Case {
 static NOTHING_FREE: &Unknowns =
     &Unknowns { initial_state: false, parameters: Vec::new(), transforms: Vec::new(), max_steps: Vec::new() };
 
+/// Members that may differ in everything.
+fn all_their_own(model: Cvsim6) -> Shared<Cvsim6> {
+    let theta: Vec<Lanes> = model.default_parameters().into_iter().map(Lanes::splat).collect();
+    let own: Vec<usize> = (0..Parameter::DeltaQLi as usize).collect();
+    Shared::new(model, &theta, &own).unwrap()
+}
+
 fn close(found: &[Lanes], lane: usize, expected: &[f64], tolerance: f64, what: &str) {
     for (k, (found, expected)) in found.iter().zip(expected).enumerate() {
         let found = found.0[lane];
@@ -105,6 +114,7 @@ fn close(found: &[Lanes], lane: usize, expected: &[f64], tolerance: f64, what: &
 #[test]
 fn sweeps_find_what_the_general_solver_finds_on_every_instruction_set() {
     let model = Cvsim6::default();
+    let shared = all_their_own(model);
     for (length_s, least) in [(0.0005, 1.0), (0.001, 1.0), (0.002, 1.0), (0.004, 0.99), (0.005, 0.99), (0.01, 0.9)] {
         let bases = bases(WIDTH, FeatureSpec::default(), length_s);
         let expressions = Expressions::new(&bases).unwrap();
@@ -114,7 +124,7 @@ fn sweeps_find_what_the_general_solver_finds_on_every_instruction_set() {
             let case = Case::at(step);
             let run = |set: InstructionSet| {
                 let mut solutions = case.solutions();
-                let progress = forecast(&model, &expressions, 1e-10, set, &mut solutions).unwrap();
+                let progress = forecast(&shared, &expressions, 1e-10, set, &mut solutions);
                 (solutions, progress)
             };
             let (swept, progress) = run(InstructionSet::Portable);
@@ -186,6 +196,7 @@ const NOISE: [f64; 6] = [2.07, 2.06, 0.146, 0.408, 0.40, 0.242];
 fn a_coupled_window_is_that_of_the_general_solver() {
     use Parameter as P;
     let model = Cvsim6::default();
+    let shared = all_their_own(model);
     let samples = [(0.3, State::A), (0.3, State::V), (0.9, State::Pa)];
     let sets: [(&[P], f64); 4] = [
         (&[P::RPv, P::CA], 0.985),
@@ -222,7 +233,7 @@ fn a_coupled_window_is_that_of_the_general_solver() {
                 let prior = Prior { root: &root, n_xi: n_u };
                 let mut run = |set: InstructionSet| {
                     let mut solutions = case.solutions();
-                    _ = forecast(&model, &expressions, 1e-11, set, &mut solutions).unwrap();
+                    _ = forecast(&shared, &expressions, 1e-11, set, &mut solutions);
                     let samples =
                         Samples { states: &data.states, weights: &data.weights, phi: &data.phi, values: &data.values };
                     let freedom = Freedom {
@@ -232,7 +243,7 @@ fn a_coupled_window_is_that_of_the_general_solver() {
                         precision: None,
                     };
                     let places = (&mut scratch, &mut solutions);
-                    let progress = fit(&model, &expressions, &samples, &freedom, 1e-11, set, places).unwrap();
+                    let progress = fit(&shared, &expressions, &samples, &freedom, 1e-11, set, places);
                     (solutions, progress)
                 };
                 let (swept, progress) = run(InstructionSet::Portable);
@@ -273,6 +284,7 @@ fn a_coupled_window_is_that_of_the_general_solver() {
 #[test]
 fn an_independent_window_is_that_of_the_general_solver() {
     let model = Cvsim6::default();
+    let shared = all_their_own(model);
     let chosen = vec![Parameter::RPv as usize, Parameter::CA as usize];
     let unknowns = independent_unknowns(&chosen);
     let (mut solver, mut general) = (CollocationSolver::default(), Solution::default());
@@ -293,7 +305,7 @@ fn an_independent_window_is_that_of_the_general_solver() {
             let variances: Vec<Lanes> =
                 chosen.iter().map(|&p| solutions.theta[p].map(|theta| prior_sd(theta).powi(2))).collect();
             let set = InstructionSet::best();
-            _ = forecast(&model, &expressions, 1e-11, set, &mut solutions).unwrap();
+            _ = forecast(&shared, &expressions, 1e-11, set, &mut solutions);
             let samples =
                 Samples { states: &data.states, weights: &data.weights, phi: &data.phi, values: &data.values };
             let freedom = Freedom {
@@ -303,7 +315,7 @@ fn an_independent_window_is_that_of_the_general_solver() {
                 precision: None,
             };
             let places = (&mut scratch, &mut solutions);
-            let progress = fit(&model, &expressions, &samples, &freedom, 1e-11, set, places).unwrap();
+            let progress = fit(&shared, &expressions, &samples, &freedom, 1e-11, set, places);
             for (lane, basis) in bases.iter().enumerate() {
                 all += 1;
                 if !progress.done[lane] {
@@ -342,15 +354,51 @@ fn batches_that_cannot_be_treated_alike_are_refused() {
     assert!(Expressions::new(&[]).is_none());
 }
 
+/// Clocks and what else does not differ are worked out once for all members, to the same bits.
+#[test]
+fn what_members_share_changes_nothing() {
+    let model = Cvsim6::default();
+    let bases = bases(WIDTH, FeatureSpec::default(), 0.004);
+    let expressions = Expressions::new(&bases).unwrap();
+    for step in (0..120).step_by(2) {
+        let mut solutions = Case::at(step).solutions();
+        let mut other = solutions.clone();
+        let chosen = [Parameter::RPv, Parameter::RA, Parameter::CA, Parameter::CLSys].map(|p| p as usize);
+        // What decides over the clock is as it was before, until the window begins.
+        let mut before = solutions.theta.clone();
+        before[Parameter::BeatPhase as usize] = Lanes::splat(0.3);
+        for own in [&chosen[..], &chosen[..3]] {
+            if own.len() < 4 {
+                let first = solutions.theta[Parameter::CLSys as usize].0[0];
+                solutions.theta[Parameter::CLSys as usize] = Lanes::splat(first);
+                other.theta.clone_from(&solutions.theta);
+                before[Parameter::CLSys as usize] = Lanes::splat(first);
+            }
+            let mut shared = Shared::new(model, &before, own).unwrap();
+            shared.begin(&solutions.theta, &[Parameter::BeatPhase as usize], &expressions, InstructionSet::best());
+            let progress = forecast(&shared, &expressions, 1e-9, InstructionSet::best(), &mut solutions);
+            let apart = forecast(&all_their_own(model), &expressions, 1e-9, InstructionSet::best(), &mut other);
+            assert_eq!(progress, apart);
+            assert_eq!(solutions, other);
+            let mut derived = [[Lanes::default(); 12]; 2];
+            let x = [&solutions.start[..], &solutions.theta[..]];
+            derive(&shared, 0.004, InstructionSet::best(), (x[0], x[1]), &mut derived[0]);
+            derive(&all_their_own(model), 0.004, InstructionSet::best(), (x[0], x[1]), &mut derived[1]);
+            assert_eq!(derived[0], derived[1]);
+        }
+    }
+}
+
 #[test]
 fn what_no_number_is_left_to_the_general_solver() {
     let model = Cvsim6::default();
+    let shared = all_their_own(model);
     let bases = bases(WIDTH, FeatureSpec::default(), 0.001);
     let expressions = Expressions::new(&bases).unwrap();
     let mut case = Case::at(20);
     case.xs[3][1] = f64::NAN;
     let mut solutions = case.solutions();
-    let progress = forecast(&model, &expressions, 1e-9, InstructionSet::best(), &mut solutions).unwrap();
+    let progress = forecast(&shared, &expressions, 1e-9, InstructionSet::best(), &mut solutions);
     assert_eq!(progress.done, std::array::from_fn(|lane| lane != 3));
 }
 

@@ -451,7 +451,7 @@ impl Default for EstimatorSettings {
             screen_artefacts: true,
             second_opinion: SecondOpinion::None,
             max_iterations: 20,
-            tolerance: 1e-6,
+            tolerance: 1e-4,
         }
     }
 }

@@ -145,6 +145,7 @@ pub struct TableWriter {
     path: PathBuf,
     writer: BufWriter<File>,
     columns: usize,
+    line: String,
 }
 
 impl TableWriter {
@@ -154,8 +155,9 @@ impl TableWriter {
     /// When the file cannot be written.
     pub fn create(path: &Path, header: &[String]) -> Result<Self, FileError> {
         let file = File::create(path).map_err(|e| FileError::file(path, &e))?;
-        let mut table = Self { path: path.to_owned(), writer: BufWriter::new(file), columns: header.len() };
-        table.line(header.iter().map(String::as_str))?;
+        let (path, columns) = (path.to_owned(), header.len());
+        let mut table = Self { path, writer: BufWriter::new(file), columns, line: header.join(",") };
+        table.write_line()?;
         Ok(table)
     }
 
@@ -165,20 +167,23 @@ impl TableWriter {
     /// When the file cannot be written.
     pub fn row(&mut self, values: &[f64]) -> Result<(), FileError> {
         debug_assert_eq!(values.len(), self.columns, "a row has as many cells as the header");
-        let cell = |v: &f64| if v.is_nan() { String::new() } else { v.to_string() };
-        self.line(values.iter().map(cell))
+        self.line.clear();
+        let mut digits = zmij::Buffer::new();
+        for (i, value) in values.iter().enumerate() {
+            if i > 0 {
+                self.line.push(',');
+            }
+            if !value.is_nan() {
+                let text = digits.format(*value);
+                self.line.push_str(text.strip_suffix(".0").unwrap_or(text));
+            }
+        }
+        self.write_line()
     }
 
-    fn line(&mut self, cells: impl Iterator<Item = impl AsRef<str>>) -> Result<(), FileError> {
-        let mut line = String::new();
-        for (i, cell) in cells.enumerate() {
-            if i > 0 {
-                line.push(',');
-            }
-            line.push_str(cell.as_ref());
-        }
-        line.push('\n');
-        self.writer.write_all(line.as_bytes()).map_err(|e| FileError::file(&self.path, &e))
+    fn write_line(&mut self) -> Result<(), FileError> {
+        self.line.push('\n');
+        self.writer.write_all(self.line.as_bytes()).map_err(|e| FileError::file(&self.path, &e))
     }
 
     /// Writes what is buffered.

@@ -31,6 +31,7 @@ use super::smoother::Smoother;
 use crate::model::lanes::{Lanes, WIDTH};
 use crate::model::{Model, Transform};
 use crate::xtfc::problem::Unknowns;
+use crate::xtfc::sweeps::Shared;
 
 /// A share of the prior variance that counts as learnt.
 const INFORMED: f64 = 1e-4;
@@ -152,7 +153,7 @@ pub struct Ensemble<M: Model> {
     /// Batches that take no part for the time being, in their order.
     resting: Vec<Batch>,
     /// Equations for eight members at once; None where members are solved one by one.
-    lanes: Option<M::Lanes>,
+    shared: Option<Shared<M::Lanes>>,
     pub(super) normals: Normals,
     pub(super) findings: Findings,
     scratch: Scratch,
@@ -232,12 +233,16 @@ impl<M: Model> Ensemble<M> {
             let belief = &settings.beliefs[p];
             Pace::new(belief.drift, belief.reversion, *centre, belief.sd)
         };
+        // Members differ in what is estimated only.
+        let alike: Vec<Lanes> = theta.iter().map(|value| Lanes::splat(*value)).collect();
+        let lanes = model.lanes().filter(|_| settings.coupling.is_xtfc());
+        let shared = lanes.and_then(|lanes| Shared::new(lanes, &alike, &estimated));
         let mut ensemble = Self {
             paces: estimated.iter().zip(&centre).map(pace).collect(),
             fits: settings.channels.iter().map(|c| channel_fit(&settings, c)).collect(),
             batches,
             resting: Vec::new(),
-            lanes: model.lanes().filter(|_| settings.coupling.is_xtfc()),
+            shared,
             model,
             settings,
             varying,
@@ -422,6 +427,7 @@ impl<M: Model> Ensemble<M> {
 
     /// Every member through the window as if there were no samples, and what that says of them.
     fn look_forward(&mut self, observations: &[Observation], parallel: &dyn Parallel) {
+        self.begin_window();
         self.each(parallel, |tools, batch| {
             batch.forecast(tools);
             batch.expect(observations, tools.settings);
@@ -431,6 +437,7 @@ impl<M: Model> Ensemble<M> {
     /// A window that nothing is learnt from.
     fn forecast(&mut self, parallel: &dyn Parallel) -> WindowReport {
         let h = self.clock_step_s();
+        self.begin_window();
         self.each(parallel, |tools, batch| {
             batch.forecast(tools);
             batch.move_on(tools, h);

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use super::{Ensemble, Observation, Parallel, WindowReport};
 use crate::estimate::adapt::fit::ChannelFit;
 use crate::estimate::adapt::pace::Pace;
-use crate::estimate::beat::BeatFollower;
+use crate::estimate::beat::{BeatCounter, Curve};
 use crate::estimate::time::EventTime;
 use crate::estimate::timing::TimingSource;
 use crate::model::Model;
@@ -33,7 +33,8 @@ pub(super) struct Checkpoint {
     elapsed_s: f64,
     window: u64,
     clock_waits: bool,
-    beat: Option<(BeatFollower, EventTime)>,
+    curves: Vec<Curve>,
+    beat: Option<(BeatCounter, Vec<f64>, EventTime)>,
 }
 
 /// The samples of some windows.
@@ -179,7 +180,8 @@ impl<M: Model> Ensemble<M> {
     }
 
     /// Makes a checkpoint of how things are.
-    fn keep(&self, checkpoint: &mut Checkpoint) {
+    fn keep(&mut self, checkpoint: &mut Checkpoint) {
+        self.take_in_looks();
         checkpoint.members.clear();
         for batch in &self.batches {
             checkpoint.members.extend_from_slice(&batch.x);
@@ -191,12 +193,19 @@ impl<M: Model> Ensemble<M> {
         checkpoint.elapsed_s = self.elapsed_s;
         checkpoint.window = self.window;
         checkpoint.clock_waits = self.clock_waits;
+        checkpoint.curves.resize_with(self.batches.len(), Curve::default);
+        for (kept, batch) in checkpoint.curves.iter_mut().zip(&self.batches) {
+            kept.clone_from(&batch.curve);
+        }
         match (&mut checkpoint.beat, &self.beats) {
-            (Some((follower, end)), Some(beats)) => {
-                follower.clone_from(&beats.follower);
+            (Some((counter, ahead, end)), Some(beats)) => {
+                counter.clone_from(&beats.counter);
+                ahead.clone_from(&beats.ahead);
                 *end = beats.end;
             }
-            (beat, beats) => *beat = beats.as_ref().map(|beats| (beats.follower.clone(), beats.end)),
+            (beat, beats) => {
+                *beat = beats.as_ref().map(|beats| (beats.counter.clone(), beats.ahead.clone(), beats.end));
+            }
         }
     }
 
@@ -212,8 +221,12 @@ impl<M: Model> Ensemble<M> {
         self.elapsed_s = checkpoint.elapsed_s;
         self.window = checkpoint.window;
         self.clock_waits = checkpoint.clock_waits;
-        if let Some((beats, (follower, end))) = self.beats.as_mut().zip(checkpoint.beat.as_ref()) {
-            beats.follower.clone_from(follower);
+        for (batch, kept) in self.batches.iter_mut().zip(&checkpoint.curves) {
+            batch.curve.clone_from(kept);
+        }
+        if let Some((beats, (counter, ahead, end))) = self.beats.as_mut().zip(checkpoint.beat.as_ref()) {
+            beats.counter.clone_from(counter);
+            beats.ahead.clone_from(ahead);
             beats.end = *end;
             beats.take_back(*end);
         }

@@ -3,6 +3,7 @@
 use super::{Ensemble, Parallel};
 use crate::estimate::batch::{Batch, Tools};
 use crate::estimate::cloud::{Cloud, degrees};
+use crate::estimate::random::Normals;
 use crate::model::lanes::{Lanes, WIDTH};
 use crate::model::{Model, Transform};
 
@@ -76,8 +77,7 @@ impl<M: Model> Ensemble<M> {
         parallel: &dyn Parallel,
         job: impl Fn(&Tools<'_, M>, &mut Batch) + Sync,
     ) {
-        let Self { model, lanes, settings, unknowns, estimated, varying, batches, .. } = self;
-        let tools = Tools { model, lanes: lanes.as_ref(), settings, unknowns, estimated, varying };
+        let (tools, batches, _) = self.take_apart();
         parallel.for_each(batches, &|batch| job(&tools, batch));
     }
 
@@ -88,9 +88,22 @@ impl<M: Model> Ensemble<M> {
         job: impl Fn(&Tools<'_, M>, &mut Batch) + Sync,
     ) {
         let count = (self.model.n_states() + self.estimated.len() + self.settings.channels.len()) * self.len();
-        let Self { model, lanes, settings, unknowns, estimated, varying, batches, normals, .. } = self;
-        let tools = Tools { model, lanes: lanes.as_ref(), settings, unknowns, estimated, varying };
+        let (tools, batches, normals) = self.take_apart();
         parallel.for_each_beside(batches, &|batch| job(&tools, batch), &mut || normals.draw_ahead(count));
+    }
+
+    pub(super) fn take_apart(&mut self) -> (Tools<'_, M>, &mut [Batch], &mut Normals) {
+        let look = self.next_look();
+        let Self { model, shared, settings, unknowns, estimated, varying, batches, normals, .. } = self;
+        (Tools { model, shared: shared.as_ref(), settings, unknowns, estimated, varying, look }, batches, normals)
+    }
+
+    /// Before the first look at a window.
+    pub(super) fn begin_window(&mut self) {
+        let (Some(shared), Some(first)) = (&mut self.shared, self.batches.first()) else { return };
+        if let Some(expressions) = &first.expressions {
+            shared.begin(&first.theta, &self.varying, expressions, self.settings.instructions);
+        }
     }
 }
 

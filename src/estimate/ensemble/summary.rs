@@ -2,7 +2,7 @@
 
 use super::Ensemble;
 use super::rows::coordinates;
-use crate::estimate::batch::{Tools, read};
+use crate::estimate::batch::{Look, Tools, read};
 use crate::estimate::smoother::Remembered;
 use crate::estimate::statistics::{Explainers, Summary, mean_and_sd, summarise};
 use crate::estimate::time::EventTime;
@@ -50,6 +50,7 @@ impl<M: Model> Ensemble<M> {
         let tools = self.tools();
         for batch in &self.batches {
             batch.states_at(&self.model, s, &mut scratch.x);
+            scratch.derived.resize(n_q - n, Lanes::default());
             batch.derive_at(&tools, t, &scratch.x, &mut scratch.derived);
             let rows = scratch.values.chunks_exact_mut(m);
             for (row, lanes) in rows.zip(scratch.x.iter().chain(&scratch.derived)) {
@@ -60,8 +61,8 @@ impl<M: Model> Ensemble<M> {
     }
 
     pub(in crate::estimate) fn tools(&self) -> Tools<'_, M> {
-        let Self { model, lanes, settings, unknowns, estimated, varying, .. } = self;
-        Tools { model, lanes: lanes.as_ref(), settings, unknowns, estimated, varying }
+        let Self { model, shared, settings, unknowns, estimated, varying, .. } = self;
+        Tools { model, shared: shared.as_ref(), settings, unknowns, estimated, varying, look: Look::default() }
     }
 
     /// One summary per quantity of [`Ensemble::snapshot`].

@@ -490,10 +490,8 @@ impl LaneModel for Cvsim6 {
     }
 
     #[inline(always)]
-    fn derive(&self, t_s: f64, x: &[Lanes; 6], theta: &[Lanes], out: &mut [Lanes]) -> bool {
-        let Some(fixed) = self.fixed(theta) else { return false };
-        let moment = <Self as LaneModel>::moment(&fixed, &Self::instant(&fixed, t_s));
-        let (_, tangent) = <Self as LaneModel>::linearise(&fixed, &moment, x);
+    fn derive((fixed, moment): (&Fixed, &Moment), x: &[Lanes; 6], theta: &[Lanes], out: &mut [Lanes]) {
+        let (_, tangent) = <Self as LaneModel>::linearise(fixed, moment, x);
         let [l, a, v, r, pa, pv] = *x;
         let of = |p: Parameter| theta[p as usize];
         let p_th = fixed.p_th;
@@ -512,7 +510,6 @@ impl LaneModel for Cvsim6 {
             of(V0Pa) + (pa - p_th) * of(CPa),
             of(V0Pv) + (pv - p_th) * of(CPv),
         ]);
-        true
     }
 
     #[inline(always)]
@@ -583,7 +580,7 @@ mod tests {
                 let (slopes, tangent) = <Cvsim6 as LaneModel>::linearise(&fixed, &moment, &x);
                 let pulled = <Cvsim6 as LaneModel>::pull(&fixed, &moment, &tangent, &dual);
                 let mut derived = [Lanes::default(); 12];
-                assert!(LaneModel::derive(&model, T_S, &x, &theta, &mut derived));
+                <Cvsim6 as LaneModel>::derive((&fixed, &moment), &x, &theta, &mut derived);
                 for lane in 0..WIDTH {
                     let (mut dx, mut dfdx, mut own) = (vec![0.0; 6], vec![0.0; 36], vec![0.0; 12]);
                     model.rhs_and_state_jacobian(T_S, &xs[lane], &thetas[lane], &mut dx, &mut dfdx);
