@@ -340,8 +340,10 @@ impl Batch {
         if basis.is_nodal() {
             let off = data.iter().zip(&self.expected).map(|(d, expected)| d.weight * (expected.0[lane] - d.value));
             let below = off.map(|off| off * off).sum();
+            // There is a place for it from the first solve on, whether or not that one needed it.
+            read(&self.window.beta, lane, beta);
+            xi.resize(tools.unknowns.len(x.len()), 0.0);
             let guess = is_tried.then(|| {
-                read(&self.window.beta, lane, beta);
                 self.scratch.xi(lane, prior.root, prior.n_xi, xi);
                 Guess { beta, xi, below }
             });

@@ -218,8 +218,9 @@ fn a_gap_is_forecast_with_growing_bands() {
     let (before, late) = (at(0.98), at(2.64));
     assert!(before.since_data_ns < 10_000_000, "{}", before.since_data_ns);
     assert!((late.since_data_ns - 1_645_000_000).abs() < 10_000_000, "{}", late.since_data_ns);
-    let band = |e: &Estimate, s: State| e.quantities[s as usize].q95 - e.quantities[s as usize].q05;
-    assert!(band(late, State::A) > band(before, State::A), "the band grows without data");
+    // By quantiles, the band of forty members would be that of the few in its tails.
+    let band = |e: &Estimate| e.quantities[State::A as usize].sd;
+    assert!(band(late) > band(before), "the band grows without data: {} {}", band(before), band(late));
     let gaps = outputs.iter().filter(|o| matches!(o, Output::Notice(n) if n.kind.name() == "gap")).count();
     let back = outputs.iter().filter(|o| matches!(o, Output::Notice(n) if n.kind.name() == "recovered")).count();
     assert_eq!((gaps, back), (2, 2));

@@ -7,7 +7,8 @@ use crate::estimate::coupling::coupled;
 use crate::estimate::smoother::Correction;
 use crate::model::Model;
 
-/// Longest time between two steps of what wanders \[s\].
+/// Members wander in steps of this length \[s\], or window by window if these are longer: for a step all of them have to be
+/// taken apart, and nothing wanders far in so short a time.
 const WANDER_S: f64 = 0.02;
 
 /// Reused from window to window.
@@ -60,8 +61,7 @@ impl<M: Model> Ensemble<M> {
     pub(super) fn first_look(&mut self, observations: &[Observation], h: f64, parallel: &dyn Parallel) -> WindowReport {
         self.apply_edits(self.elapsed_s + h, self.elapsed_s);
         self.wander_due_s += h;
-        // Between samples a little at a time is enough.
-        if !observations.is_empty() || self.wander_due_s >= WANDER_S {
+        if self.wander_due_s >= WANDER_S - 1e-9 {
             self.wander();
         }
         if observations.is_empty() {

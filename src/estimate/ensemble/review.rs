@@ -149,7 +149,10 @@ impl<M: Model> Ensemble<M> {
     /// With `doubt`, what was learnt of the paces in them is forgotten and learnt anew.
     pub(super) fn look_again(&mut self, from_s: f64, doubt: bool, parallel: &dyn Parallel) {
         // A parameter that seems to move may turn out to be a beat that came early, so the first impression is kept.
-        let before = (!doubt).then(|| self.memory.clone());
+        let before = (!doubt).then(|| {
+            let copy = self.memory.clone();
+            std::mem::replace(&mut self.memory, copy)
+        });
         let Some((checkpoint, windows)) = self.memory.rewind(from_s) else { return };
         let h = self.settings.window.length_s();
         self.restore(&checkpoint);
