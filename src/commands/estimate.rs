@@ -7,13 +7,13 @@ use hemostream::edge::config::{Config, Timing};
 use hemostream::edge::files::csv::{EventWriter, TableWriter, beat_header, beat_row, estimate_header, estimate_row};
 use hemostream::edge::files::record::Record;
 use hemostream::edge::outlet::notice_text;
-use hemostream::estimate::estimator::{Estimator, Input, Output};
+use hemostream::estimate::estimator::{Input, Output};
 use hemostream::estimate::time::ArrivalTime;
 use hemostream::estimate::window::RawSample;
 use hemostream::model::Model;
 use hemostream::model::cvsim6::Pressures;
-use hemostream::model::discrepancy::Circulation;
 use hemostream::runtime::clock::Clock;
+use hemostream::runtime::offline::Offline;
 use hemostream::runtime::workers::Workers;
 use indicatif::ProgressBar;
 
@@ -95,7 +95,7 @@ fn check_record(path: &Path, config: &Config) -> Result<f64, Failure> {
 
 /// An estimator between a record and a table.
 struct Run {
-    estimator: Estimator<Circulation>,
+    bed: Offline,
     /// Channel of each column, where it is listened to.
     channels: Vec<Option<usize>>,
     table: TableWriter,
@@ -118,7 +118,8 @@ struct Run {
 impl Run {
     fn new(config: &Config, args: &Estimate, reader: &Record, seconds: f64) -> Result<Self, Failure> {
         let model = config.circulation()?;
-        let estimator = Estimator::new(model.clone(), config.estimator_settings()?).map_err(failed)?;
+        let bed = Offline::new(model.clone(), config.estimator_settings()?).map_err(failed)?;
+        let estimator = bed.estimator();
         let channel = |state: &usize| estimator.settings().channels.iter().position(|c| c.state == *state);
         let channels: Vec<Option<usize>> = reader.states().iter().map(channel).collect();
         for (state, _) in reader.states().iter().zip(&channels).filter(|(_, c)| c.is_none()) {
@@ -134,7 +135,7 @@ impl Run {
             events: args.events.as_deref().map(EventWriter::create).transpose()?,
             beats: args.beats.as_deref().map(|path| TableWriter::create(path, &beat_header(&model))).transpose()?,
             smoothed: config.estimator.smoothing_lag_s > 0.0,
-            estimator,
+            bed,
             channels,
             outputs: Vec::new(),
             progress,
@@ -171,7 +172,7 @@ impl Run {
     }
 
     fn drive(&mut self, input: Input, workers: &Workers) -> Result<(), Failure> {
-        self.estimator.handle(input, self.last, workers, &mut self.outputs);
+        self.bed.handle(input, self.last, workers, &mut self.outputs);
         for output in self.outputs.drain(..) {
             match output {
                 Output::Estimate(estimate) if !self.smoothed => self.table.row(&estimate_row(&estimate))?,
@@ -190,8 +191,9 @@ impl Run {
                 }
                 Output::Notice(notice) => {
                     self.notices += 1;
-                    let (channel, model) = (notice.channel, self.estimator.model());
-                    let name = channel.map_or("", |c| model.states()[self.estimator.settings().channels[c].state].name);
+                    let (channel, model) = (notice.channel, self.bed.estimator().model());
+                    let name =
+                        channel.map_or("", |c| model.states()[self.bed.estimator().settings().channels[c].state].name);
                     let text = notice_text(model, notice.kind);
                     if let Some(events) = &mut self.events {
                         events.row(notice.time, notice.kind.name(), name, &text)?;
@@ -215,7 +217,7 @@ impl Run {
             events.finish()?;
         }
         let wall = hemostream::estimate::time::s_from_ns(self.clock.now().0);
-        let member_windows = self.windows as f64 * self.estimator.settings().members as f64;
+        let member_windows = self.windows as f64 * self.bed.estimator().settings().members as f64;
         say(format!(
             "{:.3} s of record in {wall:.2} s ({:.1} patient-seconds per second), {} windows, {:.2} iterations per \
              member and window, {:.2} % solved one by one, {} not converged",
@@ -227,7 +229,7 @@ impl Run {
             self.not_converged,
         ));
         let refused: Vec<String> =
-            self.estimator.refused().iter().map(|(cause, n)| format!("{n} {}", cause.name())).collect();
+            self.bed.estimator().refused().iter().map(|(cause, n)| format!("{n} {}", cause.name())).collect();
         if !refused.is_empty() {
             say(format!("samples refused: {}", refused.join(", ")));
         }

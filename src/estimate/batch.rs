@@ -104,6 +104,8 @@ pub struct Batch {
     pub(super) x: Vec<Lanes>,
     /// Parameters there, clocks moved on, `[n_parameters]`.
     pub(super) theta: Vec<Lanes>,
+    /// States and what varies of the parameters, as they were before the last lesson taken at once.
+    before: (Vec<Lanes>, Vec<Lanes>),
     /// The last window.
     pub(super) window: Solutions,
     /// What they expect of the samples of this window, `[n_observations]`.
@@ -152,6 +154,7 @@ impl Batch {
             expressions: None,
             bases,
             window: Solutions { start: x.clone(), theta: theta.clone(), beta: Vec::new(), end: x.clone() },
+            before: (Vec::new(), Vec::new()),
             x,
             theta,
             expected: Vec::new(),
@@ -222,8 +225,7 @@ impl Batch {
 
     /// What a kernel has found; the members it has left out are solved by `one`.
     fn take(&mut self, progress: Option<Progress>, mut one: impl FnMut(&mut Self, usize)) {
-        let none = Progress { sweeps: 0, done: [false; WIDTH], physics_rms: Lanes::default() };
-        let progress = progress.unwrap_or(none);
+        let progress = progress.unwrap_or(Progress::NONE);
         for lane in 0..self.count {
             if progress.done[lane] {
                 self.solved[lane] = true;
@@ -236,25 +238,63 @@ impl Batch {
         }
     }
 
-    /// What the window says before any sample is taken in.
+    /// What the window says before any sample is taken in, after [`Batch::forecast`].
     pub(super) fn expect(&mut self, observations: &[Observation], settings: &EstimatorSettings) {
+        self.locate(observations, settings);
         self.expected.clear();
-        self.phi.clear();
-        self.states.clear();
-        for observation in observations {
-            let state = settings.channels[observation.channel].state;
-            self.states.push(state);
-            let at = self.position(observation.s);
-            let phi = &self.positions[at].phi;
-            self.phi.extend_from_slice(phi);
+        for (&state, phi) in self.states.iter().zip(self.phi.chunks_exact(self.rank)) {
             let beta = &self.window.beta[state * self.rank..][..self.rank];
             let start = self.window.start[state];
             self.expected.push(phi.iter().zip(beta).fold(start, |x, (phi, beta)| x + *phi * *beta));
         }
     }
 
+    /// Which states are observed, and where.
+    fn locate(&mut self, observations: &[Observation], settings: &EstimatorSettings) {
+        self.phi.clear();
+        self.states.clear();
+        for observation in observations {
+            self.states.push(settings.channels[observation.channel].state);
+            let at = self.position(observation.s);
+            self.phi.extend_from_slice(&self.positions[at].phi);
+        }
+    }
+
     /// Learns from samples, after [`Batch::forecast`] and [`Batch::expect`].
     pub(super) fn fit<M: Model>(&mut self, tools: &Tools<'_, M>, lesson: &Lesson<'_>) {
+        self.hear(tools, lesson);
+        let progress = self.by_kernel(tools, lesson, false);
+        self.conclude(tools, lesson, progress);
+    }
+
+    /// [`Batch::forecast`], [`Batch::expect`] and [`Batch::fit`] at once; [`Batch::take_back`] undoes it.
+    pub(super) fn forecast_and_fit<M: Model>(&mut self, tools: &Tools<'_, M>, lesson: &Lesson<'_>) {
+        let (x, theta) = &mut self.before;
+        x.clone_from(&self.x);
+        theta.clear();
+        theta.extend(tools.varying.iter().map(|p| self.theta[*p]));
+        self.begin(tools);
+        self.locate(lesson.observations, tools.settings);
+        self.hear(tools, lesson);
+        let progress = self.by_kernel(tools, lesson, true);
+        if progress.is_some() {
+            self.conclude(tools, lesson, progress);
+        } else {
+            self.forecast(tools);
+            self.expect(lesson.observations, tools.settings);
+            self.fit(tools, lesson);
+        }
+    }
+
+    /// As it was before a lesson that was taken at once, but for what was looked at.
+    pub(super) fn take_back(&mut self, varying: &[usize]) {
+        let (x, theta) = &self.before;
+        self.x.clone_from(x);
+        varying.iter().zip(theta).for_each(|(p, value)| self.theta[*p] = *value);
+    }
+
+    /// The samples as every member hears them.
+    fn hear<M: Model>(&mut self, tools: &Tools<'_, M>, lesson: &Lesson<'_>) {
         let settings = tools.settings;
         self.weights.clear();
         let weight = |sd: &f64| if settings.coupling.is_bayesian() { 1.0 / sd } else { settings.weights.data };
@@ -272,25 +312,39 @@ impl Batch {
                 self.variances.push(self.theta[p].map(|theta| root(theta).powi(2)));
             }
         }
+    }
+
+    /// All members side by side, with or without the forecast; None where that cannot be done.
+    fn by_kernel<M: Model>(&mut self, tools: &Tools<'_, M>, lesson: &Lesson<'_>, forecast: bool) -> Option<Progress> {
+        let (shared, expressions) = tools.shared.zip(self.expressions.as_ref())?;
+        if lesson.observations.len() > MAX_SAMPLES {
+            return None;
+        }
+        let settings = tools.settings;
+        let covariance =
+            lesson.shared.map_or(Covariance::Own(&self.variances), |prior| Covariance::Shared(prior.covariance));
+        let freedom = Freedom {
+            unknowns: tools.unknowns,
+            covariance,
+            physics_weights: &settings.weights.physics,
+            precision: lesson.shared.map(|prior| prior.precision),
+        };
+        let samples = Samples { states: &self.states, weights: &self.weights, phi: &self.phi, values: &self.values };
+        let (tolerance, instructions) = (settings.stopping.tolerance_mmhg, settings.instructions);
+        if forecast {
+            let places = (&mut self.scratch, &mut self.window, &mut self.expected);
+            sweeps::forecast_and_fit(shared, expressions, &samples, &freedom, tolerance, instructions, places)
+        } else {
+            let places = (&mut self.scratch, &mut self.window);
+            Some(sweeps::fit(shared, expressions, &samples, &freedom, tolerance, instructions, places))
+        }
+    }
+
+    /// Takes what a kernel has found, and solves the rest one by one.
+    fn conclude<M: Model>(&mut self, tools: &Tools<'_, M>, lesson: &Lesson<'_>, progress: Option<Progress>) {
         // The account of the forecast is not that of the window.
         self.tally = Tally::default();
-        let kernel = tools.shared.zip(self.expressions.as_ref()).filter(|_| lesson.observations.len() <= MAX_SAMPLES);
-        let is_tried = kernel.is_some();
-        let progress = kernel.map(|(shared, expressions)| {
-            let covariance =
-                lesson.shared.map_or(Covariance::Own(&self.variances), |prior| Covariance::Shared(prior.covariance));
-            let freedom = Freedom {
-                unknowns: tools.unknowns,
-                covariance,
-                physics_weights: &settings.weights.physics,
-                precision: lesson.shared.map(|prior| prior.precision),
-            };
-            let samples =
-                Samples { states: &self.states, weights: &self.weights, phi: &self.phi, values: &self.values };
-            let tolerance = settings.stopping.tolerance_mmhg;
-            let places = (&mut self.scratch, &mut self.window);
-            sweeps::fit(shared, expressions, &samples, &freedom, tolerance, settings.instructions, places)
-        });
+        let is_tried = progress.is_some();
         self.take(progress, |batch, lane| {
             let data = lesson.observations.iter().enumerate().map(|(k, o)| Datum {
                 s: o.s,

@@ -346,7 +346,7 @@ impl<M: Model> Estimator<M> {
         let learnt: &[Observation] = if self.tracker.is_acquired() { &observations } else { &[] };
         self.tally(window.end, learnt, out);
         self.keep_time(window, &observations, parallel, out);
-        self.publish(window, learnt, first, out);
+        self.publish((window, first), learnt, parallel, out);
         self.put_out_beats(false, out);
         let samples = learnt.len();
         out.push(Output::Window(WindowDone { end: window.end, closed_at: window.closed_at, samples, report }));
@@ -475,7 +475,7 @@ impl<M: Model> Estimator<M> {
     pub fn disagreement(&self) -> Option<Disagreement> {
         let (first, second) = (self.ensemble.as_ref()?, self.second.as_ref()?);
         let apart = |(a, b): (&Summary, &Summary)| (a.mean - b.mean) / a.epistemic_sd.hypot(b.epistemic_sd);
-        let states = |of: &Ensemble<M>| of.summarise_at(1.0, &mut Snapshot::default());
+        let states = |of: &Ensemble<M>| of.summarise_at(1.0, &mut Snapshot::default(), &Serial);
         let parameters =
             |of: &Ensemble<M>| of.summarise_parameters().into_iter().map(|p| p.summary).collect::<Vec<_>>();
         Some(Disagreement {
@@ -485,12 +485,18 @@ impl<M: Model> Estimator<M> {
     }
 
     /// Puts out an estimate for every published time in the window.
-    fn publish(&mut self, window: &ClosedWindow, observations: &[Observation], first: bool, out: &mut Vec<Output>) {
+    fn publish(
+        &mut self,
+        (window, first): (&ClosedWindow, bool),
+        observations: &[Observation],
+        parallel: &dyn Parallel,
+        out: &mut Vec<Output>,
+    ) {
         let period = self.settings.publish_period_ns;
         let before = if first { window.start.0 - 1 } else { window.start.0 };
         let mut time = EventTime((before.div_euclid(period) + 1) * period);
         while time <= window.end {
-            out.push(Output::Estimate(self.estimate(window, observations, time)));
+            out.push(Output::Estimate(self.estimate(window, observations, time, parallel)));
             if self.settings.live.smoothing_lag_ns > 0
                 && let Some(ensemble) = &mut self.ensemble
             {
@@ -506,7 +512,13 @@ impl<M: Model> Estimator<M> {
         }
     }
 
-    fn estimate(&mut self, window: &ClosedWindow, observations: &[Observation], time: EventTime) -> Estimate {
+    fn estimate(
+        &mut self,
+        window: &ClosedWindow,
+        observations: &[Observation],
+        time: EventTime,
+        parallel: &dyn Parallel,
+    ) -> Estimate {
         let s = position(window, time);
         let within = observations.iter().map(|o| observed_at(window, o)).filter(|t| *t <= time).max();
         let last_data = within.or(self.last_observation);
@@ -525,7 +537,7 @@ impl<M: Model> Estimator<M> {
             time,
             since_data_ns: last_data.map_or(0, |last| time.ns_since(last).max(0)),
             members: ensemble.len(),
-            quantities: ensemble.summarise_at(s, &mut self.scratch.snapshot),
+            quantities: ensemble.summarise_at(s, &mut self.scratch.snapshot, parallel),
             parameters: parameters.map(|(p, at)| (p, time.ns_since(*at).max(0))).collect(),
             ensemble: self.want_members.then(|| ensemble.members_at_end()),
         }

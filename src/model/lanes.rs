@@ -296,8 +296,14 @@ pub trait LaneModel: Copy + fmt::Debug + Send + Sync {
     fn pull(fixed: &Self::Fixed, moment: &Self::Moment, tangent: &Self::Tangent, dual: &Self::State) -> Self::State;
 
     /// An approximation of `(I - phi df/dx)^-1`: the better, the faster sweeps converge; their result does not depend on
-    /// it.
-    fn relaxation(fixed: &Self::Fixed, moment: &Self::Moment, tangent: &Self::Tangent, phi: Lanes) -> Self::Relaxation;
+    /// it. Into a place, since it is too large to be moved about.
+    fn relaxation(
+        fixed: &Self::Fixed,
+        moment: &Self::Moment,
+        tangent: &Self::Tangent,
+        phi: Lanes,
+        out: &mut Self::Relaxation,
+    );
 
     /// The relaxation, or its transpose, times a residual.
     fn relax(relaxation: &Self::Relaxation, residual: &Self::State, transposed: bool) -> Self::State;
@@ -361,7 +367,7 @@ impl LaneModel for NoLanes {
         *dual
     }
 
-    fn relaxation((): &(), (): &(), (): &(), _: Lanes) {}
+    fn relaxation((): &(), (): &(), (): &(), _: Lanes, (): &mut ()) {}
 
     fn relax((): &(), residual: &Self::State, _: bool) -> Self::State {
         *residual

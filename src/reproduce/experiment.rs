@@ -82,7 +82,7 @@ impl<M: Model> Experiment<'_, M> {
 
             for &t in take(&mut reports, end, h, |t| *t) {
                 trace.times_s.push(t);
-                trace.quantities.push(ensemble.summarise_at(s(t), &mut scratch));
+                trace.quantities.push(ensemble.summarise_at(s(t), &mut scratch, parallel));
                 trace.parameters.push(ensemble.summarise_parameters().iter().map(|p| p.summary).collect());
             }
             for &t in take(&mut wanted, end, h, |t| *t) {

@@ -9,5 +9,6 @@
 pub mod bed;
 pub mod clock;
 pub mod governor;
+pub mod offline;
 pub mod service;
 pub mod workers;

@@ -164,6 +164,10 @@ impl Parallel for Workers {
         }
     }
 
+    fn both(&self, one: &mut (dyn FnMut() + Send), other: &mut (dyn FnMut() + Send)) {
+        self.pool.install(|| rayon::join(one, other));
+    }
+
     fn for_indices(&self, count: usize, job: &(dyn Fn(usize) + Sync)) {
         self.pool.install(|| (0..count).into_par_iter().with_min_len(CHUNK).for_each(job));
     }

@@ -122,6 +122,13 @@ pub struct Solutions {
     pub end: Vec<Lanes>,
 }
 
+impl Solutions {
+    fn make_room(&mut self, expressions: &Expressions) {
+        self.beta.resize(expressions.times_s.len() * self.start.len(), Lanes::default());
+        self.end.resize(self.start.len(), Lanes::default());
+    }
+}
+
 /// How a solve went.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Progress {
@@ -131,6 +138,11 @@ pub struct Progress {
     pub done: [bool; WIDTH],
     /// Root mean square of the physics residual at the nodes \[mmHg/s\].
     pub physics_rms: Lanes,
+}
+
+impl Progress {
+    /// Nothing was done.
+    pub const NONE: Self = Self { sweeps: 0, done: [false; WIDTH], physics_rms: Lanes([0.0; WIDTH]) };
 }
 
 /// The samples of a window.
@@ -237,9 +249,7 @@ pub fn forecast<M: LaneModel>(
     instructions: InstructionSet,
     solutions: &mut Solutions,
 ) -> Progress {
-    let nodes = expressions.times_s.len();
-    solutions.beta.resize(nodes * solutions.start.len(), Lanes::default());
-    solutions.end.resize(solutions.start.len(), Lanes::default());
+    solutions.make_room(expressions);
     let limit = tolerance_mmhg / expressions.length_s;
     instructions.run(Forecast { shared, expressions, limit, solutions })
 }
@@ -256,7 +266,26 @@ pub fn fit<M: LaneModel>(
     instructions: InstructionSet,
     (scratch, solutions): (&mut FitScratch, &mut Solutions),
 ) -> Progress {
-    instructions.run(Fit { shared, expressions, samples, freedom, tolerance_mmhg, scratch, solutions })
+    let job = Fit { shared, expressions, samples, freedom, tolerance_mmhg, expected: None, scratch, solutions };
+    // It has somewhere to begin.
+    instructions.run(job).unwrap_or(Progress::NONE)
+}
+
+/// [`forecast`] and [`fit`] at once, which is less work than one after the other; `expected` is what the forecast says of
+/// the samples, `[n_samples]`. None where that does not get done for all members: nothing has been changed then.
+#[must_use]
+pub fn forecast_and_fit<M: LaneModel>(
+    shared: &Shared<M>,
+    expressions: &Expressions,
+    samples: &Samples<'_>,
+    freedom: &Freedom<'_>,
+    tolerance_mmhg: f64,
+    instructions: InstructionSet,
+    (scratch, solutions, expected): (&mut FitScratch, &mut Solutions, &mut Vec<Lanes>),
+) -> Option<Progress> {
+    solutions.make_room(expressions);
+    let expected = Some(expected);
+    instructions.run(Fit { shared, expressions, samples, freedom, tolerance_mmhg, expected, scratch, solutions })
 }
 
 /// Derived quantities of the states `x` at `t_s` after the start of the window, `[n_derived]`.
@@ -316,40 +345,14 @@ struct Tangents<'a, M: LaneModel> {
     relaxations: &'a mut AtNodes<M::Relaxation>,
 }
 
-/// The errors of the equations that a dual path stands for, `e = -g / w^2`.
-struct Errors<'a, M: LaneModel> {
-    g: &'a AtNodes<M::State>,
-    /// `-1 / w^2`
-    factors: &'a M::State,
-}
-
-#[allow(clippy::inline_always)]
-impl<M: LaneModel> Errors<'_, M> {
-    #[inline(always)]
-    fn add_to(&self, residual: &mut M::State, node: usize) {
-        for ((to, g), factor) in residual.as_mut().iter_mut().zip(self.g[node].as_ref()).zip(self.factors.as_ref()) {
-            *to = *to + *g * *factor;
-        }
-    }
-
-    /// Sum of their squares.
-    #[inline(always)]
-    fn squares(&self) -> Lanes {
-        let mut squares = Lanes::default();
-        for g in self.g {
-            for (g, factor) in g.as_ref().iter().zip(self.factors.as_ref()) {
-                let error = *g * *factor;
-                squares = squares + error * error;
-            }
-        }
-        squares
-    }
-}
-
 /// The dual path: `g = (I - df/dx phi)^-T b`, and `(df/dx)^T g`.
 struct Dual<'a, M: LaneModel> {
     g: &'a mut AtNodes<M::State>,
     pulled: &'a mut AtNodes<M::State>,
+    /// `b`: what the samples pull at, as it is felt at the nodes.
+    drive: &'a mut AtNodes<M::State>,
+    /// The slopes that the equations are to give: those of the path without the errors `e = -g / w^2` that this stands for.
+    held: &'a mut AtNodes<M::State>,
 }
 
 #[allow(clippy::inline_always)]
@@ -401,7 +404,8 @@ impl<'a, M: LaneModel> Equations<'a, M> {
     fn look_ahead(&self, tangent: M::Tangent, at: &mut Tangents<'_, M>) {
         for (node, moment) in self.moments.iter().enumerate() {
             at.tangents.push(tangent);
-            at.relaxations.push(M::relaxation(&self.fixed, moment, &tangent, self.phi(node)[node]));
+            at.relaxations.push(M::Relaxation::default());
+            M::relaxation(&self.fixed, moment, &tangent, self.phi(node)[node], &mut at.relaxations[node]);
         }
     }
 
@@ -412,22 +416,17 @@ impl<'a, M: LaneModel> Equations<'a, M> {
         &self,
         path: &mut Path<'_, M>,
         at: &mut Tangents<'_, M>,
-        errors: Option<&Errors<'_, M>>,
+        held: Option<&AtNodes<M::State>>,
         mut states: Option<&mut AtNodes<M::State>>,
     ) -> Lanes {
         let mut largest = Lanes::splat(0.0);
-        if let Some(states) = &mut states {
-            states.clear();
-        }
         for node in 0..self.nodes() {
             let phi = self.phi(node);
             let x = path.at(phi);
             let (mut residual, tangent) = M::linearise(&self.fixed, &self.moments[node], &x);
-            for (r, k) in residual.as_mut().iter_mut().zip(path.slopes[node].as_ref()) {
+            let against = held.map_or(&path.slopes[node], |held| &held[node]);
+            for (r, k) in residual.as_mut().iter_mut().zip(against.as_ref()) {
                 *r = *r - *k;
-            }
-            if let Some(errors) = errors {
-                errors.add_to(&mut residual, node);
             }
             for r in residual.as_ref() {
                 largest = r.abs().larger(largest);
@@ -436,37 +435,42 @@ impl<'a, M: LaneModel> Equations<'a, M> {
             let step = M::relax(&at.relaxations[node], &residual, false);
             add::<M>(&mut path.slopes[node], &step);
             if !M::is_alike(&tangent, &at.tangents[node]) {
-                at.relaxations[node] = M::relaxation(&self.fixed, &self.moments[node], &tangent, phi[node]);
+                M::relaxation(&self.fixed, &self.moments[node], &tangent, phi[node], &mut at.relaxations[node]);
                 at.tangents[node] = tangent;
             }
             if let Some(states) = &mut states {
-                states.push(x);
+                states[node] = x;
             }
         }
         largest
     }
 
-    /// The same for the dual equations, which run backwards, driven by what the samples pull at; the largest residual and
-    /// the largest of what drives them.
+    /// Sweeps until nothing is left of the residuals but what is within `limit`; the `states` at the nodes by then.
     #[inline(always)]
-    fn sweep_dual(
+    fn settle(
         &self,
-        at: &Tangents<'_, M>,
-        (samples, pulls): (&Samples<'_>, &[Lanes]),
-        dual: &mut Dual<'_, M>,
-    ) -> (Lanes, Lanes) {
-        let (mut largest, mut size) = (Lanes::splat(0.0), Lanes::splat(0.0));
-        for node in (0..self.nodes()).rev() {
-            let mut residual = M::State::default();
-            // State by state: by the index of the observed one, these would have to go through memory.
-            for (i, entry) in residual.as_mut().iter_mut().enumerate() {
-                for (j, pull) in pulls.iter().enumerate() {
-                    if samples.states[j] == i {
-                        *entry = *entry + *pull * samples.phi[j * self.nodes() + node];
-                        size = entry.abs().larger(size);
-                    }
-                }
+        path: &mut Path<'_, M>,
+        at: &mut Tangents<'_, M>,
+        limit: f64,
+        mut states: Option<&mut AtNodes<M::State>>,
+    ) -> (Left, usize) {
+        let (mut left, mut sweeps) = (Left::START, 0);
+        while sweeps < MAX_SWEEPS {
+            sweeps += 1;
+            left.after(self.sweep(path, at, None, states.as_deref_mut()), Lanes::splat(limit));
+            if left.of_limit.all_within(1.0) {
+                break;
             }
+        }
+        (left, sweeps)
+    }
+
+    /// The same for the dual equations, which run backwards; the largest residual.
+    #[inline(always)]
+    fn sweep_dual(&self, at: &Tangents<'_, M>, dual: &mut Dual<'_, M>) -> Lanes {
+        let mut largest = Lanes::splat(0.0);
+        for node in (0..self.nodes()).rev() {
+            let mut residual = dual.drive[node];
             let column = self.expressions.values[node..].iter().step_by(self.nodes());
             for (phi, pulled) in column.zip(dual.pulled.iter()) {
                 for (r, pulled) in residual.as_mut().iter_mut().zip(pulled.as_ref()) {
@@ -483,7 +487,7 @@ impl<'a, M: LaneModel> Equations<'a, M> {
             add::<M>(&mut dual.g[node], &step);
             dual.pulled[node] = M::pull(&self.fixed, &self.moments[node], &at.tangents[node], &dual.g[node]);
         }
-        (largest, size)
+        largest
     }
 }
 
@@ -492,12 +496,54 @@ impl<M: LaneModel> Dual<'_, M> {
     /// Where nothing pulls.
     #[inline(always)]
     fn rest(&mut self, nodes: usize) {
-        for at_nodes in [&mut *self.g, &mut *self.pulled] {
-            at_nodes.clear();
-            for _ in 0..nodes {
-                at_nodes.push(M::State::default());
+        for at_nodes in [&mut *self.g, &mut *self.pulled, &mut *self.drive, &mut *self.held] {
+            rest::<M>(at_nodes, nodes);
+        }
+    }
+
+    /// From the slopes of the path, and `-1 / w^2`.
+    #[inline(always)]
+    fn hold(&mut self, slopes: &AtNodes<M::State>, factors: &M::State) {
+        for ((held, slopes), g) in self.held.iter_mut().zip(slopes).zip(self.g.iter()) {
+            let errors = g.as_ref().iter().zip(factors.as_ref());
+            for ((held, slope), (g, factor)) in held.as_mut().iter_mut().zip(slopes.as_ref()).zip(errors) {
+                *held = *slope - *g * *factor;
             }
         }
+    }
+
+    /// Sum of the squares of the errors.
+    #[inline(always)]
+    fn squares(&self, factors: &M::State) -> Lanes {
+        let mut squares = Lanes::default();
+        for g in self.g.iter() {
+            for (g, factor) in g.as_ref().iter().zip(factors.as_ref()) {
+                let error = *g * *factor;
+                squares = squares + error * error;
+            }
+        }
+        squares
+    }
+
+    /// From what the samples pull at; the largest of it.
+    #[inline(always)]
+    fn drive_by(&mut self, samples: &Samples<'_>, pulls: &[Lanes]) -> Lanes {
+        let mut size = Lanes::splat(0.0);
+        for drive in self.drive.iter_mut() {
+            *drive = M::State::default();
+        }
+        for (j, (observed, pull)) in samples.states.iter().zip(pulls).enumerate() {
+            for (drive, phi) in self.drive.iter_mut().zip(samples.phi(j)) {
+                let entry = &mut drive.as_mut()[*observed];
+                *entry = *entry + *pull * *phi;
+            }
+        }
+        for drive in &*self.drive {
+            for entry in drive.as_ref() {
+                size = entry.abs().larger(size);
+            }
+        }
+        size
     }
 }
 
@@ -554,6 +600,15 @@ impl<'a, M: LaneModel> Path<'a, M> {
 
 #[allow(clippy::inline_always)]
 #[inline(always)]
+fn rest<M: LaneModel>(at_nodes: &mut AtNodes<M::State>, nodes: usize) {
+    at_nodes.clear();
+    for _ in 0..nodes {
+        at_nodes.push(M::State::default());
+    }
+}
+
+#[allow(clippy::inline_always)]
+#[inline(always)]
 fn state<M: LaneModel>(values: &[Lanes]) -> M::State {
     let mut state = M::State::default();
     state.as_mut().copy_from_slice(values);
@@ -582,13 +637,26 @@ fn dot(a: &[Lanes], b: &[Lanes]) -> Lanes {
 #[allow(clippy::inline_always)]
 #[inline(always)]
 fn refuse_what_is_no_number(end: &[Lanes], done: &mut [bool; WIDTH]) {
-    let mut none = Lanes::splat(0.0);
-    for x in end {
-        none = none + *x * Lanes::splat(0.0);
-    }
-    for (done, none) in done.iter_mut().zip(none.0) {
+    for (done, none) in done.iter_mut().zip(nothing_of(end).0) {
         *done &= !none.is_nan();
     }
+}
+
+#[allow(clippy::inline_always)]
+#[inline(always)]
+fn are_numbers(values: &[Lanes]) -> bool {
+    nothing_of(values).all_within(0.0)
+}
+
+/// Zero, or no number where one of these is none or infinite.
+#[allow(clippy::inline_always)]
+#[inline(always)]
+fn nothing_of(values: &[Lanes]) -> Lanes {
+    let mut none = Lanes::splat(0.0);
+    for x in values {
+        none = none + *x * Lanes::splat(0.0);
+    }
+    none
 }
 
 /// What a sweep has left of residuals that were measured in the course of it: with `theta` the factor by which they shrank
@@ -677,14 +745,7 @@ impl<M: LaneModel> pulp::NullaryFnOnce for Forecast<'_, M> {
         let (mut tangents, mut relaxations) = (AtNodes::new(), AtNodes::new());
         let mut at = Tangents::<M> { tangents: &mut tangents, relaxations: &mut relaxations };
         equations.look_ahead(tangent, &mut at);
-        let (mut left, mut sweeps) = (Left::START, 0);
-        while sweeps < MAX_SWEEPS {
-            sweeps += 1;
-            left.after(equations.sweep(&mut path, &mut at, None, None), Lanes::splat(limit));
-            if left.of_limit.all_within(1.0) {
-                break;
-            }
-        }
+        let (left, sweeps) = equations.settle(&mut path, &mut at, limit, None);
         path.write(&equations, solutions);
         let physics_rms = left.of_limit * Lanes::splat(limit);
         let mut done = left.of_limit.0.map(|share| share <= 1.0);
@@ -699,55 +760,75 @@ struct Fit<'a, M: LaneModel> {
     samples: &'a Samples<'a>,
     freedom: &'a Freedom<'a>,
     tolerance_mmhg: f64,
+    /// Begins with the forecast, if there is a place for what it says of the samples.
+    expected: Option<&'a mut Vec<Lanes>>,
     scratch: &'a mut FitScratch,
     solutions: &'a mut Solutions,
 }
 
 #[allow(clippy::inline_always)]
 impl<M: LaneModel> pulp::NullaryFnOnce for Fit<'_, M> {
-    type Output = Progress;
+    type Output = Option<Progress>;
 
     #[inline(always)]
-    fn call(self) -> Progress {
-        let Self { shared, expressions, samples, freedom, tolerance_mmhg, scratch, solutions } = self;
+    fn call(self) -> Option<Progress> {
+        let Self { shared, expressions, samples, freedom, tolerance_mmhg, expected, scratch, solutions } = self;
         let (mut moments, mut instants) = (AtNodes::new(), AtNodes::new());
         let timed = freedom.unknowns.parameters.iter().any(|&p| M::is_timed(p));
         let kept = timed.then_some(&mut instants);
         let model = &shared.model;
         let mut equations = Equations::<M>::new(shared, expressions, &solutions.theta, &mut moments, kept);
         let nodes = equations.nodes();
+        let limit = tolerance_mmhg / expressions.length_s;
         let mean = state::<M>(&solutions.start);
-        let mut slopes = AtNodes::new();
-        for node in 0..nodes {
-            let mut slope = M::State::default();
-            for (slope, beta) in slope.as_mut().iter_mut().zip(solutions.beta.chunks_exact(nodes)) {
-                *slope = beta[node];
-            }
-            slopes.push(slope);
-        }
-        let mut path = Path::<M> { start: mean, slopes: &mut slopes };
-        // Derivatives where the members are; the residual is that of the forecast.
+        let (mut slopes, mut states) = (AtNodes::new(), AtNodes::new());
+        rest::<M>(&mut states, nodes);
         let (mut tangents, mut relaxations) = (AtNodes::new(), AtNodes::new());
         let mut at = Tangents::<M> { tangents: &mut tangents, relaxations: &mut relaxations };
-        let (_, tangent) = M::linearise(&equations.fixed, &equations.moments[0], &path.start);
-        equations.look_ahead(tangent, &mut at);
-        let mut states = AtNodes::new();
-        equations.sweep(&mut path, &mut at, None, Some(&mut states));
+        let mut path = if let Some(expected) = expected {
+            let (mut path, tangent) = Path::straight(&equations, &solutions.start, &mut slopes);
+            equations.look_ahead(tangent, &mut at);
+            let (left, _) = equations.settle(&mut path, &mut at, limit, Some(&mut states));
+            let end = path.at(&expressions.end);
+            if !left.of_limit.all_within(1.0) || !are_numbers(end.as_ref()) {
+                return None;
+            }
+            expected.clear();
+            for (j, &observed) in samples.states.iter().enumerate() {
+                expected.push(path.state_at(observed, samples.phi(j)));
+            }
+            path
+        } else {
+            for node in 0..nodes {
+                let mut slope = M::State::default();
+                for (slope, beta) in slope.as_mut().iter_mut().zip(solutions.beta.chunks_exact(nodes)) {
+                    *slope = beta[node];
+                }
+                slopes.push(slope);
+            }
+            let mut path = Path::<M> { start: mean, slopes: &mut slopes };
+            // Derivatives where the members are; the residual is that of the forecast.
+            let (_, tangent) = M::linearise(&equations.fixed, &equations.moments[0], &path.start);
+            equations.look_ahead(tangent, &mut at);
+            equations.sweep(&mut path, &mut at, None, Some(&mut states));
+            path
+        };
 
         scratch.begin(samples, freedom, &path, &solutions.theta);
-        let (mut g, mut pulled) = (AtNodes::new(), AtNodes::new());
-        let mut dual = Dual::<M> { g: &mut g, pulled: &mut pulled };
+        let (mut g, mut pulled, mut drive, mut held) = (AtNodes::new(), AtNodes::new(), AtNodes::new(), AtNodes::new());
+        let mut dual = Dual::<M> { g: &mut g, pulled: &mut pulled, drive: &mut drive, held: &mut held };
         if freedom.precision.is_none() {
             scratch.guess(model, &equations, samples, freedom, (&mut dual, &at), &states, &solutions.theta);
         }
         dual.rest(nodes);
         scratch.advance();
-        let mut progress = Progress { sweeps: 0, done: [false; WIDTH], physics_rms: Lanes::default() };
-        let mut of_dual = M::State::default();
+        let mut progress = Progress::NONE;
+        let (mut of_dual, mut most_of_dual) = (M::State::default(), 0.0_f64);
         for (factor, weight) in of_dual.as_mut().iter_mut().zip(freedom.physics_weights) {
             *factor = Lanes::splat(-1.0 / (weight * weight));
+            most_of_dual = most_of_dual.max(1.0 / (weight * weight));
         }
-        let limit = Lanes::splat(tolerance_mmhg / expressions.length_s);
+        let limit = Lanes::splat(limit);
         let (mut left, mut dual_left) = (Left::START, Left::START);
         while progress.sweeps < MAX_ROUNDS {
             progress.sweeps += 1;
@@ -757,16 +838,19 @@ impl<M: LaneModel> pulp::NullaryFnOnce for Fit<'_, M> {
             {
                 *pull = Lanes::splat(*weight) * *residual;
             }
-            let (dual_residual, size) = equations.sweep_dual(&at, (samples, &scratch.pulls), &mut dual);
-            // Relative to what drives it: corrections are of the order of a mmHg. Where nothing pulls, nothing is left.
-            let least = Lanes::splat(f64::MIN_POSITIVE);
-            dual_left.after(dual_residual, (size * Lanes::splat(tolerance_mmhg)).larger(least));
+            let size = dual.drive_by(samples, &scratch.pulls);
+            let dual_residual = equations.sweep_dual(&at, &mut dual);
 
             // States at the start and parameters follow from that, and the path that belongs to them.
-            let within =
+            let (within, moved) =
                 scratch.place(model, &mut equations, samples, freedom, (&dual, &states), (mean, &mut path), solutions);
-            let errors = Errors { g: &*dual.g, factors: &of_dual };
-            let residual = equations.sweep(&mut path, &mut at, Some(&errors), Some(&mut states));
+            // What is left of the dual path, relative to what drives it, is left of what it has moved. Where nothing pulls,
+            // nothing is left.
+            let moved = (size * Lanes::splat(most_of_dual * expressions.length_s)).larger(moved);
+            let share = Lanes::splat(tolerance_mmhg) / moved.larger(Lanes::splat(tolerance_mmhg));
+            dual_left.after(dual_residual, (size * share).larger(Lanes::splat(f64::MIN_POSITIVE)));
+            dual.hold(path.slopes, &of_dual);
+            let residual = equations.sweep(&mut path, &mut at, Some(&*dual.held), Some(&mut states));
 
             // What it makes of the samples.
             let mut off = Lanes::default();
@@ -788,11 +872,10 @@ impl<M: LaneModel> pulp::NullaryFnOnce for Fit<'_, M> {
         }
         #[allow(clippy::cast_precision_loss)]
         let count = (nodes * solutions.start.len()) as f64;
-        let errors = Errors::<M> { g: &*dual.g, factors: &of_dual };
-        progress.physics_rms = (errors.squares() / Lanes::splat(count)).sqrt();
+        progress.physics_rms = (dual.squares(&of_dual) / Lanes::splat(count)).sqrt();
         path.write(&equations, solutions);
         refuse_what_is_no_number(&solutions.end, &mut progress.done);
-        progress
+        Some(progress)
     }
 }
 
@@ -835,6 +918,9 @@ fn pull_back<M: LaneModel>(
     }
 }
 
+/// Of one: what a change of a parameter does to pressures of a hundred mmHg, sooner or later.
+const PER_CENT: f64 = 100.0;
+
 /// Sweeps through the dual equations that are good enough for a guess.
 const GUESS_SWEEPS: usize = 2;
 
@@ -874,8 +960,9 @@ impl FitScratch {
             let observed = samples.states[j];
             let weight = Lanes::splat(samples.weights[j]);
             dual.rest(nodes);
+            dual.drive_by(&samples.only(j), &[weight]);
             for _ in 0..GUESS_SWEEPS {
-                equations.sweep_dual(at, (&samples.only(j), &[weight]), dual);
+                equations.sweep_dual(at, dual);
             }
             let (of_u, of_errors) = answer.split_at_mut(n_u);
             pull_back(model, equations, freedom, (dual, states), theta, of_u);
@@ -992,7 +1079,8 @@ impl FitScratch {
     }
 
     /// Moves the state at the start and the parameters to where the dual path says, and the equations with them. Positive
-    /// where no coordinate moved further than its limit.
+    /// where no coordinate moved further than its limit; and how far the state has moved \[mmHg\], with a per cent of a
+    /// parameter for one.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn place<M: LaneModel>(
@@ -1004,7 +1092,7 @@ impl FitScratch {
         (dual, states): (&Dual<'_, M>, &AtNodes<M::State>),
         (mean, path): (M::State, &mut Path<'_, M>),
         solutions: &mut Solutions,
-    ) -> Lanes {
+    ) -> (Lanes, Lanes) {
         let unknowns = freedom.unknowns;
         let n = if unknowns.initial_state { path.start.as_ref().len() } else { 0 };
         let mut gradient = std::mem::take(&mut self.gradient);
@@ -1015,13 +1103,16 @@ impl FitScratch {
             }
         }
         self.gradient = gradient;
+        let (mut within, mut moved) = (Lanes::splat(1.0), Lanes::splat(0.0));
         for (i, start) in path.start.as_mut()[..n].iter_mut().enumerate() {
-            *start = mean.as_ref()[i] + freedom.covariance.shift(i, &self.gradient);
+            let shift = freedom.covariance.shift(i, &self.gradient);
+            *start = mean.as_ref()[i] + shift;
+            moved = shift.abs().larger(moved);
         }
-        let mut within = Lanes::splat(1.0);
         for (k, (&p, transform)) in unknowns.parameters.iter().zip(&unknowns.transforms).enumerate() {
             let shift = freedom.covariance.shift(n + k, &self.gradient);
             within = (Lanes::splat(unknowns.max_steps[k]) - shift.abs()).choose(within, Lanes::default());
+            moved = (shift.abs() * Lanes::splat(PER_CENT)).larger(moved);
             solutions.theta[p] = match transform {
                 Transform::Log => self.mean_theta[p] * shift.exp(),
                 Transform::Linear { scale } => self.mean_theta[p] + shift * Lanes::splat(*scale),
@@ -1035,6 +1126,6 @@ impl FitScratch {
         if timed {
             equations.set_moments();
         }
-        within
+        (within, moved)
     }
 }

@@ -145,7 +145,7 @@ fn tracked_delta_is_the_flow_that_is_missing() {
         if window < 85 {
             continue;
         }
-        let summary = ensemble.summarise_at(1.0, &mut scratch);
+        let summary = ensemble.summarise_at(1.0, &mut scratch, &Serial);
         let (x, q) = (patient.state(), patient.derived()[5]);
         let r_pv = config.patient.r_pv;
         let missing = q - (x[State::Pa as usize] - x[State::Pv as usize]) / r_pv;
@@ -177,7 +177,7 @@ fn the_models_part_of_the_band_is_published() {
         for _ in 0..100 {
             ensemble.step(&[], &Serial);
         }
-        let summary = ensemble.summarise_at(1.0, &mut Snapshot::default());
+        let summary = ensemble.summarise_at(1.0, &mut Snapshot::default(), &Serial);
         let first = if discrepant { 7 } else { 6 };
         let (p_pa, q_pv) = (&summary[State::Pa as usize], &summary[first + 5]);
         assert_eq!(discrepant, q_pv.model_sd > 0.0, "{q_pv:?}");

@@ -18,11 +18,10 @@ pub fn square(root: &[f64], n: usize, out: &mut Vec<f64>) {
     }
 }
 
-/// Inverse covariance of samples in units of their noise `sd`, `[m x m]`, into `out`, from a root of the covariance of
-/// what is expected of them.
-pub fn precision(expected: &[f64], sd: &[f64], factor: &mut Vec<f64>, out: &mut Vec<f64>) {
+/// Inverse covariance of samples in units of their noise `sd`, `[m x m]`, into `out`, from the covariance of what is
+/// expected of them, which is gone on return.
+pub fn precision(factor: &mut [f64], sd: &[f64], out: &mut Vec<f64>) {
     let m = sd.len();
-    square(expected, m, factor);
     for (j, row) in factor.chunks_exact_mut(m).enumerate() {
         row.iter_mut().zip(sd).for_each(|(entry, other)| *entry /= sd[j] * other);
         row[j] += 1.0;

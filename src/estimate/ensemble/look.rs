@@ -1,7 +1,7 @@
 //! One window of X-TFC: what the members expect, how far off the samples are, what is learnt of that.
 
 use super::{Ensemble, Observation, Parallel, Walk, WindowReport};
-use crate::estimate::batch::{SharedPrior, read_expectations};
+use crate::estimate::batch::{Lesson, SharedPrior, read_expectations};
 use crate::estimate::cloud::Cloud;
 use crate::estimate::coupling::coupled;
 use crate::estimate::smoother::Correction;
@@ -26,6 +26,8 @@ pub(super) struct Scratch {
     expected: Vec<f64>,
     expectations: Cloud,
     judged: Judged,
+    /// The noise that samples were taken to have \[mmHg\].
+    assumed: Vec<f64>,
     /// Shared prior, `[n_u x n_u]`.
     root: Vec<f64>,
     covariance: Vec<f64>,
@@ -67,29 +69,28 @@ impl<M: Model> Ensemble<M> {
         if observations.is_empty() {
             return self.forecast(parallel);
         }
-        self.look_forward(observations, parallel);
         let mut scratch = std::mem::take(&mut self.scratch);
-        self.judge(observations, &mut scratch);
         let report = if self.listening {
-            let report = self.take_in(observations, h, &mut scratch, parallel);
+            self.set_prior(observations, h, &mut scratch);
+            let report = self.learn_at_once(observations, &mut scratch, parallel);
+            let report = report.unwrap_or_else(|| self.learn_in_turn(observations, &mut scratch, parallel));
+            if self.settings.live.smoothing_lag_ns > 0 {
+                self.correct_the_past(observations, &scratch.expected, &scratch.judged.sd, &scratch.noise);
+            }
             self.tell_the_fits(observations, h, &scratch.judged);
             report
         } else {
+            self.look_forward(observations, parallel);
+            self.judge(observations, &mut scratch);
             self.go_on(parallel)
         };
         self.scratch = scratch;
         report
     }
 
-    /// The update of the members by the samples of a window.
-    fn take_in(
-        &mut self,
-        observations: &[Observation],
-        h: f64,
-        scratch: &mut Scratch,
-        parallel: &dyn Parallel,
-    ) -> WindowReport {
-        let Scratch { rows, cloud, noise, expected, expectations, judged, root, .. } = scratch;
+    /// What is believed before the samples of a window: the covariance of the members; and how the samples are perturbed.
+    fn set_prior(&mut self, observations: &[Observation], h: f64, scratch: &mut Scratch) {
+        let Scratch { rows, cloud, noise, root, .. } = scratch;
         self.read_rows(rows);
         cloud.set(rows, self.len(), self.settings.instructions);
         self.normals.draw(observations.len(), self.len(), Some(cloud), noise);
@@ -102,15 +103,86 @@ impl<M: Model> Ensemble<M> {
         if self.held {
             self.fix_parameters(root);
         }
-        if self.settings.live.smoothing_lag_ns > 0 {
-            self.correct_the_past(observations, expected, &judged.sd, noise);
-        }
         coupled::square(root, cloud.len(), &mut scratch.covariance);
-        coupled::precision(expectations.root(), &judged.sd, &mut scratch.factor, &mut scratch.precision);
         scratch.before.clear();
         scratch.before.extend((self.model.n_states()..cloud.len()).map(|row| (cloud.mean()[row], cloud.sd(row))));
-        let prior = SharedPrior { root, covariance: &scratch.covariance, precision: &scratch.precision };
-        self.learn(observations, (&judged.sd, noise), (Some(prior), &scratch.before), parallel)
+    }
+
+    /// The update of the members by the samples of a window, as long as these are what they are expected to be. None, and
+    /// nothing done, if one of them is too far off to pull as it would by the noise of its sensor.
+    fn learn_at_once(
+        &mut self,
+        observations: &[Observation],
+        scratch: &mut Scratch,
+        parallel: &dyn Parallel,
+    ) -> Option<WindowReport> {
+        if self.is_surprised {
+            return None;
+        }
+        let Scratch { noise, root, covariance, precision, factor, assumed, before, .. } = &mut *scratch;
+        assumed.clear();
+        assumed.extend(observations.iter().map(|o| self.noise_of(o.channel)));
+        // Of the states at the start, which is good enough for a guess.
+        let (n_u, states) = (before.len() + self.model.n_states(), &self.settings.channels);
+        let state = |o: &Observation| states[o.channel].state;
+        factor.clear();
+        for o in observations {
+            factor.extend(observations.iter().map(|other| covariance[state(o) * n_u + state(other)]));
+        }
+        coupled::precision(factor, assumed, precision);
+        let lesson = Lesson {
+            observations,
+            sd: assumed,
+            noise,
+            members: self.len(),
+            shared: Some(SharedPrior { root, covariance, precision }),
+        };
+        self.take_lesson_at_once(&lesson, parallel);
+        self.judge(observations, scratch);
+        if self.is_surprised {
+            self.take_back();
+            return None;
+        }
+        let report = self.account();
+        self.compare(&scratch.before);
+        Some(report)
+    }
+
+    /// The update of the members by the samples of a window, once it is known what is expected of these.
+    fn learn_in_turn(
+        &mut self,
+        observations: &[Observation],
+        scratch: &mut Scratch,
+        parallel: &dyn Parallel,
+    ) -> WindowReport {
+        self.look_forward(observations, parallel);
+        self.judge(observations, scratch);
+        let Scratch { noise, expectations, judged, root, covariance, precision, factor, before, .. } = scratch;
+        coupled::square(expectations.root(), observations.len(), factor);
+        coupled::precision(factor, &judged.sd, precision);
+        let prior = SharedPrior { root, covariance, precision };
+        self.learn(observations, (&judged.sd, noise), (Some(prior), before), parallel)
+    }
+
+    fn take_lesson_at_once(&mut self, lesson: &Lesson<'_>, parallel: &dyn Parallel) {
+        let h = self.clock_step_s();
+        self.begin_window();
+        self.each_and_draw_ahead(parallel, |tools, batch| {
+            batch.forecast_and_fit(tools, lesson);
+            batch.move_on(tools, h);
+        });
+    }
+
+    /// Back to before the last lesson that was taken at once.
+    fn take_back(&mut self) {
+        for batch in &mut self.batches {
+            batch.take_back(&self.varying);
+        }
+        // The look before it is in the curves by now, and would be taken in again.
+        let is_due = self.next_look().is_due;
+        if let Some(beats) = self.beats.as_mut().filter(|_| is_due) {
+            beats.counter.due_s = None;
+        }
     }
 
     /// After a window, what was off in it.
@@ -135,15 +207,17 @@ impl<M: Model> Ensemble<M> {
         if observations.is_empty() {
             return self.forecast(parallel);
         }
-        self.look_forward(observations, parallel);
         let mut scratch = std::mem::take(&mut self.scratch);
-        self.judge(observations, &mut scratch);
-        let Scratch { noise, judged, before, .. } = &mut scratch;
-        self.stated_noise(observations, &mut judged.sd);
+        let Scratch { noise, assumed, before, .. } = &mut scratch;
+        self.stated_noise(observations, assumed);
         self.normals.draw(observations.len(), self.len(), None, noise);
         before.clear();
         before.extend((0..self.estimated.len()).map(|k| self.coordinate(k)));
-        let report = self.learn(observations, (&judged.sd, noise), (None, before), parallel);
+        let lesson = Lesson { observations, sd: assumed, noise, members: self.len(), shared: None };
+        self.take_lesson_at_once(&lesson, parallel);
+        self.judge(observations, &mut scratch);
+        let report = self.account();
+        self.compare(&scratch.before);
         self.scratch = scratch;
         report
     }
@@ -171,6 +245,11 @@ impl<M: Model> Ensemble<M> {
         }
     }
 
+    /// The noise of a channel, as it is known by now \[mmHg\].
+    fn noise_of(&self, channel: usize) -> f64 {
+        self.settings.channels[channel].noise_sd_mmhg * self.fits[channel].noise_factor()
+    }
+
     /// What the members expect of the samples, and how far off each sample is.
     fn judge(&mut self, observations: &[Observation], scratch: &mut Scratch) {
         let Scratch { expected, expectations, judged, .. } = scratch;
@@ -179,14 +258,18 @@ impl<M: Model> Ensemble<M> {
         judged.sd.clear();
         judged.residuals.clear();
         judged.expected_sd.clear();
+        self.findings.expected.clear();
+        self.findings.innovations.clear();
+        self.is_surprised = false;
         for (j, o) in observations.iter().enumerate() {
             let (mean, spread) = (expectations.mean()[j], expectations.sd(j));
             let stated = self.settings.channels[o.channel].noise_sd_mmhg;
-            let noise = stated * self.fits[o.channel].noise_factor();
+            let noise = self.noise_of(o.channel);
             let expected_sd = (spread * spread + noise * noise).sqrt();
             let innovation = (o.value - mean) / expected_sd;
             // A heavy tail (Huber): what is far off may be an artefact and pulls no more than what is just credible.
             let far = innovation.abs() / self.settings.adaptation.outlier_sd;
+            self.is_surprised |= far > 1.0;
             judged.sd.push(if far > 1.0 { noise * far.sqrt() } else { noise });
             judged.residuals.push((o.value - mean) / stated);
             judged.expected_sd.push(expected_sd);

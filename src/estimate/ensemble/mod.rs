@@ -54,6 +54,9 @@ pub trait Parallel: Sync {
 
     /// Calls `job(index)` for every index below `count`.
     fn for_indices(&self, count: usize, job: &(dyn Fn(usize) + Sync));
+
+    /// Does both.
+    fn both(&self, one: &mut (dyn FnMut() + Send), other: &mut (dyn FnMut() + Send));
 }
 
 /// One after the other.
@@ -73,6 +76,11 @@ impl Parallel for Serial {
 
     fn for_indices(&self, count: usize, job: &(dyn Fn(usize) + Sync)) {
         (0..count).for_each(job);
+    }
+
+    fn both(&self, one: &mut (dyn FnMut() + Send), other: &mut (dyn FnMut() + Send)) {
+        one();
+        other();
     }
 }
 
@@ -177,6 +185,8 @@ pub struct Ensemble<M: Model> {
     /// Windows solved.
     window: u64,
     listening: bool,
+    /// Whether a sample of the last window with samples was further off than noise explains.
+    is_surprised: bool,
     held: bool,
     clock_waits: bool,
     /// In order of time: those to come, and those of the last moments.
@@ -263,6 +273,7 @@ impl<M: Model> Ensemble<M> {
             smoother: Smoother::default(),
             window: 0,
             listening: true,
+            is_surprised: false,
             held: false,
             clock_waits: false,
             edits: Vec::new(),

@@ -1,7 +1,7 @@
 //! What the members say together.
 
-use super::Ensemble;
 use super::rows::coordinates;
+use super::{Ensemble, Parallel, Serial};
 use crate::estimate::batch::{Look, Tools, read};
 use crate::estimate::smoother::Remembered;
 use crate::estimate::statistics::{Explainers, Summary, mean_and_sd, summarise};
@@ -66,12 +66,12 @@ impl<M: Model> Ensemble<M> {
     }
 
     /// One summary per quantity of [`Ensemble::snapshot`].
-    pub fn summarise_at(&self, s: f64, scratch: &mut Snapshot) -> Vec<Summary> {
-        self.summarise(self.snapshot(s, scratch), self.cycles())
+    pub fn summarise_at(&self, s: f64, scratch: &mut Snapshot, parallel: &dyn Parallel) -> Vec<Summary> {
+        self.summarise(self.snapshot(s, scratch), self.cycles(), parallel)
     }
 
     /// One summary per row of `values` `[n_quantities x n_members]`, states first, where the clock says `cycles`.
-    fn summarise(&self, values: &mut [f64], cycles: Option<f64>) -> Vec<Summary> {
+    fn summarise(&self, values: &mut [f64], cycles: Option<f64>, parallel: &dyn Parallel) -> Vec<Summary> {
         let (n, m) = (self.model.n_states(), self.len());
         let explainers = Explainers::new(&values[(n - self.model.n_discrepancies()) * m..n * m], m);
         let noise = |q: usize| self.settings.aleatoric_sd_mmhg.get(q).copied().unwrap_or(0.0);
@@ -80,11 +80,20 @@ impl<M: Model> Ensemble<M> {
             let own = self.settings.channels.iter().position(|c| c.state == q);
             own.map_or(0.0, |channel| self.fits[channel].systematic_sd(phase))
         };
-        let summary = |(q, row): (usize, &mut [f64])| {
-            let share = explainers.share_of(row);
-            summarise(row, noise(q), share).widened(systematic(q))
+        // The rows from `first` on.
+        let fill = |first: usize, rows: &mut [f64], out: &mut [Summary]| {
+            for ((q, row), out) in (first..).zip(rows.chunks_exact_mut(m)).zip(out) {
+                let share = explainers.share_of(row);
+                *out = summarise(row, noise(q), share).widened(systematic(q));
+            }
         };
-        values.chunks_exact_mut(m).enumerate().map(summary).collect()
+        let count = values.len() / m;
+        let mut out = vec![Summary::default(); count];
+        let half = count / 2;
+        let (rows, other_rows) = values.split_at_mut(half * m);
+        let (summaries, other_summaries) = out.split_at_mut(half);
+        parallel.both(&mut || fill(0, rows, summaries), &mut || fill(half, other_rows, other_summaries));
+        out
     }
 
     /// A parameter of every member at the end of the last window.
@@ -181,6 +190,6 @@ impl<M: Model> Ensemble<M> {
             let own = self.estimated.iter().position(|&p| p == cycle.phase);
             own.map_or(moment.theta[cycle.phase], |k| mean_and_sd(&parameters[k * m..(k + 1) * m]).0)
         });
-        Some((moment.time, self.summarise(&mut values, cycles), summaries))
+        Some((moment.time, self.summarise(&mut values, cycles, &Serial), summaries))
     }
 }

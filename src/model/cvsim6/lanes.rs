@@ -212,7 +212,7 @@ pub struct Relaxation {
 impl Around {
     /// From a ventricle, its valves, and the elastances before and behind it.
     #[inline(always)]
-    fn new(ventricle: &Ventricle, phi: Lanes, valves: [Lanes; 2], elastances: [Lanes; 2]) -> Self {
+    fn set(&mut self, ventricle: &Ventricle, phi: Lanes, valves: [Lanes; 2], elastances: [Lanes; 2]) {
         let (one, elastance) = (Lanes::splat(1.0), phi * ventricle.elastance);
         let of = [elastance * valves[0], elastance * valves[1]];
         let to = [phi * elastances[0] * valves[0], phi * elastances[1] * valves[1]];
@@ -222,12 +222,10 @@ impl Around {
         let whole = own * (a * b) - of[0] * to[0] * b - of[1] * to[1] * a;
         let inverse = one / (whole * (a * b));
         let (over_a, over_b) = (inverse * whole * b, inverse * whole * a);
-        Self {
-            neighbours: [over_a, over_b],
-            ventricle: inverse * (a * b) * (a * b),
-            of_neighbour: [of[0] * over_a, of[1] * over_b],
-            to_neighbour: [to[0] * over_a, to[1] * over_b],
-        }
+        self.neighbours = [over_a, over_b];
+        self.ventricle = inverse * (a * b) * (a * b);
+        self.of_neighbour = [of[0] * over_a, of[1] * over_b];
+        self.to_neighbour = [to[0] * over_a, to[1] * over_b];
     }
 
     #[inline(always)]
@@ -413,12 +411,10 @@ impl LaneModel for Cvsim6 {
     }
 
     #[inline(always)]
-    fn relaxation(fixed: &Fixed, moment: &Moment, tangent: &Tangent, phi: Lanes) -> Relaxation {
+    fn relaxation(fixed: &Fixed, moment: &Moment, tangent: &Tangent, phi: Lanes, out: &mut Relaxation) {
         let [e_a, e_v, e_pa, e_pv] = fixed.elastances;
-        Relaxation {
-            left: Around::new(&moment.left, phi, [tangent.li, tangent.lo], [e_pv, e_a]),
-            right: Around::new(&moment.right, phi, [tangent.ri, tangent.ro], [e_v, e_pa]),
-        }
+        out.left.set(&moment.left, phi, [tangent.li, tangent.lo], [e_pv, e_a]);
+        out.right.set(&moment.right, phi, [tangent.ri, tangent.ro], [e_v, e_pa]);
     }
 
     #[inline(always)]
@@ -446,41 +442,40 @@ impl LaneModel for Cvsim6 {
     ) -> Lanes {
         use Parameter as P;
         let is = |p: P| parameter == p as usize;
-        let (slopes, tangent) = Self::linearise(fixed, moment, x);
         let [l, a, v, r, pa, pv] = *x;
         let zero = Lanes::splat(0.0);
         if let Some(by) = by {
+            let (_, tangent) = Self::linearise(fixed, moment, x);
             let (li, lo) = ((pv - l) * tangent.li, (l - a) * tangent.lo);
             let (ri, ro) = ((v - r) * tangent.ri, (r - pa) * tangent.ro);
             let left = (li - lo) * by.left.elastance + (l - fixed.p_th) * by.left.stiffening;
             let right = (ri - ro) * by.right.elastance + (r - fixed.p_th) * by.right.stiffening;
             return dual[0] * left + dual[3] * right;
         }
+        // Each parameter by itself: it is called for one at a time, and what others need is not worked out.
         let [e_a, e_v, e_pa, e_pv] = fixed.elastances;
         let (e_l, e_r) = (moment.left.elastance, moment.right.elastance);
         let [g_li, g_lo, g_a, g_ri, g_ro, g_pv] = fixed.conductances;
-        let [d_l, d_a, d_v] = [dual[0] * e_l, dual[1] * e_a, dual[2] * e_v];
-        let [d_r, d_pa, d_pv] = [dual[3] * e_r, dual[4] * e_pa, dual[5] * e_pv];
         if is(P::RLi) {
-            by_resistance(pv - l, tangent.li, g_li, (d_pv, d_l))
+            by_resistance(pv - l, (pv - l).choose(g_li, zero), g_li, (dual[5] * e_pv, dual[0] * e_l))
         } else if is(P::RLo) {
-            by_resistance(l - a, tangent.lo, g_lo, (d_l, d_a))
+            by_resistance(l - a, (l - a).choose(g_lo, zero), g_lo, (dual[0] * e_l, dual[1] * e_a))
         } else if is(P::RA) {
-            by_resistance(a - v, g_a, g_a, (d_a, d_v))
+            by_resistance(a - v, g_a, g_a, (dual[1] * e_a, dual[2] * e_v))
         } else if is(P::RRi) {
-            by_resistance(v - r, tangent.ri, g_ri, (d_v, d_r))
+            by_resistance(v - r, (v - r).choose(g_ri, zero), g_ri, (dual[2] * e_v, dual[3] * e_r))
         } else if is(P::RRo) {
-            by_resistance(r - pa, tangent.ro, g_ro, (d_r, d_pa))
+            by_resistance(r - pa, (r - pa).choose(g_ro, zero), g_ro, (dual[3] * e_r, dual[4] * e_pa))
         } else if is(P::RPv) {
-            by_resistance(pa - pv, g_pv, g_pv, (d_pa, d_pv))
+            by_resistance(pa - pv, g_pv, g_pv, (dual[4] * e_pa, dual[5] * e_pv))
         } else if is(P::CA) {
-            zero - dual[1] * slopes[1] * e_a
+            zero - dual[1] * Self::linearise(fixed, moment, x).0[1] * e_a
         } else if is(P::CV) {
-            zero - dual[2] * slopes[2] * e_v
+            zero - dual[2] * Self::linearise(fixed, moment, x).0[2] * e_v
         } else if is(P::CPa) {
-            zero - dual[4] * slopes[4] * e_pa
+            zero - dual[4] * Self::linearise(fixed, moment, x).0[4] * e_pa
         } else if is(P::CPv) {
-            zero - dual[5] * slopes[5] * e_pv
+            zero - dual[5] * Self::linearise(fixed, moment, x).0[5] * e_pv
         } else if is(P::PTh) {
             zero - dual[0] * moment.left.stiffening - dual[3] * moment.right.stiffening
         } else {
@@ -634,7 +629,8 @@ mod tests {
             let (_, tangent) = <Cvsim6 as LaneModel>::linearise(&fixed, &moment, &x);
             let phi = 3e-4;
             for transposed in [false, true] {
-                let relaxation = Cvsim6::relaxation(&fixed, &moment, &tangent, Lanes::splat(phi));
+                let mut relaxation = Relaxation::default();
+                Cvsim6::relaxation(&fixed, &moment, &tangent, Lanes::splat(phi), &mut relaxation);
                 let solved = Cvsim6::relax(&relaxation, &residual, transposed);
                 for lane in 0..WIDTH {
                     let (mut dx, mut dfdx) = (vec![0.0; 6], vec![0.0; 36]);
