@@ -1,6 +1,6 @@
 #![doc = include_str!("collocation.md")]
 
-use super::lu::{SmallLu, solve_spd};
+use super::lu::{factorise, solve, solve_spd, solve_transposed};
 use super::problem::{Account, Point, Solution, WindowProblem, dot, resize, sample_rows};
 use crate::model::Model;
 
@@ -353,9 +353,13 @@ struct Blocks {
     n_nodes: usize,
     /// Block of each state.
     block_of: Vec<usize>,
-    /// States of each block, ascending.
-    states: Vec<Vec<usize>>,
-    factors: Vec<SmallLu>,
+    /// States, block by block, ascending in each; and where each block ends among them.
+    states: Vec<usize>,
+    ends: Vec<usize>,
+    /// The matrices of the blocks, one behind the other in a place that is large enough for a single one; and how their rows
+    /// were exchanged.
+    a: Vec<f64>,
+    pivots: Vec<usize>,
     scratch: Vec<f64>,
 }
 
@@ -366,10 +370,15 @@ impl Blocks {
         let nodes = problem.basis.positions().len();
         self.n_nodes = nodes;
         self.partition(n, jacobians);
+        self.a.resize((n * nodes).pow(2), 0.0);
+        self.pivots.resize(n * nodes, 0);
+        self.scratch.reserve(n * nodes);
         let mut worst = 1.0_f64;
-        for (states, lu) in self.states.iter().zip(&mut self.factors) {
+        let (mut first, mut at) = (0, 0);
+        for &end in &self.ends {
+            let states = &self.states[first..end];
             let size = states.len() * nodes;
-            let a = lu.matrix(size);
+            let a = &mut self.a[at..at + size * size];
             for (bi, &i) in states.iter().enumerate() {
                 for (bj, &j) in states.iter().enumerate() {
                     let phi = problem.expression(j);
@@ -383,7 +392,8 @@ impl Blocks {
                     }
                 }
             }
-            worst = worst.max(lu.factorise());
+            worst = worst.max(factorise(a, &mut self.pivots[first * nodes..end * nodes]));
+            (first, at) = (end, at + size * size);
         }
         worst
     }
@@ -401,18 +411,25 @@ impl Blocks {
                 }
             }
         }
-        self.states.resize_with(n, Vec::new);
-        self.factors.resize_with(n, SmallLu::default);
-        for (block, states) in self.states.iter_mut().enumerate() {
-            states.clear();
-            states.extend((0..n).filter(|&i| self.block_of[i] == block));
+        self.states.clear();
+        self.ends.clear();
+        for block in 0..n {
+            let before = self.states.len();
+            self.states.extend((0..n).filter(|&i| self.block_of[i] == block));
+            if self.states.len() > before {
+                self.ends.push(self.states.len());
+            }
         }
     }
 
     /// Solves `A x = b` (or with the transpose) in place; `b` is `[n_states x n_nodes]`.
     fn solve(&mut self, b: &mut [f64], transposed: bool) {
         let nodes = self.n_nodes;
-        for (states, lu) in self.states.iter().zip(&self.factors) {
+        let (mut first, mut at) = (0, 0);
+        for &end in &self.ends {
+            let states = &self.states[first..end];
+            let (a, pivots) = (&self.a[at..], &self.pivots[first * nodes..end * nodes]);
+            (first, at) = (end, at + pivots.len().pow(2));
             // Right-hand sides often touch one block only.
             let touched = |i: &usize| b[i * nodes..(i + 1) * nodes].iter().any(|v| v.to_bits() << 1 != 0);
             if !states.iter().any(touched) {
@@ -421,9 +438,9 @@ impl Blocks {
             self.scratch.clear();
             states.iter().for_each(|i| self.scratch.extend_from_slice(&b[i * nodes..(i + 1) * nodes]));
             if transposed {
-                lu.solve_transposed(&mut self.scratch);
+                solve_transposed(a, pivots, &mut self.scratch);
             } else {
-                lu.solve(&mut self.scratch);
+                solve(a, pivots, &mut self.scratch);
             }
             for (i, x) in states.iter().zip(self.scratch.chunks_exact(nodes)) {
                 b[i * nodes..(i + 1) * nodes].copy_from_slice(x);

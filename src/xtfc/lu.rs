@@ -1,96 +1,78 @@
-//! LU factorisation with partial pivoting of small dense matrices, without allocation after the first use.
+//! LU factorisation with partial pivoting of small dense matrices, in the storage of the caller.
 
-/// A factorised square matrix; storage is reused.
-#[derive(Debug, Clone, Default)]
-pub(super) struct SmallLu {
-    n: usize,
-    /// Row-major: L below the diagonal (unit diagonal), U on and above.
-    a: Vec<f64>,
-    /// Row `k` was exchanged with row `pivots[k]` at step `k`.
-    pivots: Vec<usize>,
+/// Factorises a square matrix `a` `[n x n]`, row-major, in place: L below the diagonal (unit diagonal), U on and above;
+/// row `k` was exchanged with row `pivots[k]` `[n]` at step `k`. Returns the ratio of the largest to the smallest pivot,
+/// infinite if singular.
+pub(super) fn factorise(a: &mut [f64], pivots: &mut [usize]) -> f64 {
+    let n = pivots.len();
+    let (mut largest, mut smallest) = (0.0_f64, f64::INFINITY);
+    for k in 0..n {
+        let mut pivot_row = k;
+        for i in k + 1..n {
+            if a[i * n + k].abs() > a[pivot_row * n + k].abs() {
+                pivot_row = i;
+            }
+        }
+        pivots[k] = pivot_row;
+        if pivot_row != k {
+            let (upper, lower) = a.split_at_mut(pivot_row * n);
+            upper[k * n..(k + 1) * n].swap_with_slice(&mut lower[..n]);
+        }
+        let pivot = a[k * n + k];
+        largest = largest.max(pivot.abs());
+        smallest = smallest.min(pivot.abs());
+        let (upper, lower) = a.split_at_mut((k + 1) * n);
+        let row_k = &upper[k * n + k + 1..];
+        let reciprocal = 1.0 / pivot;
+        for row in lower.chunks_exact_mut(n) {
+            let factor = row[k] * reciprocal;
+            row[k] = factor;
+            // The matrices are sparse until fill-in.
+            if factor.to_bits() << 1 != 0 {
+                for (a, b) in row[k + 1..].iter_mut().zip(row_k) {
+                    *a -= factor * b;
+                }
+            }
+        }
+    }
+    if smallest > 0.0 && largest.is_finite() { largest / smallest } else { f64::INFINITY }
 }
 
-impl SmallLu {
-    /// The `n x n` matrix to fill before [`SmallLu::factorise`], row-major, zeroed.
-    pub(super) fn matrix(&mut self, n: usize) -> &mut [f64] {
-        self.n = n;
-        super::problem::resize(&mut self.a, n * n);
-        &mut self.a
+/// Solves `A x = b` in place, for a matrix that [`factorise`] has taken apart.
+pub(super) fn solve(a: &[f64], pivots: &[usize], b: &mut [f64]) {
+    let n = pivots.len();
+    for (k, &p) in pivots.iter().enumerate() {
+        b.swap(k, p);
     }
-
-    /// Factorises in place; returns the ratio of the largest to the smallest pivot, infinite if singular.
-    pub(super) fn factorise(&mut self) -> f64 {
-        let n = self.n;
-        self.pivots.clear();
-        let (mut largest, mut smallest) = (0.0_f64, f64::INFINITY);
-        for k in 0..n {
-            let mut pivot_row = k;
-            for i in k + 1..n {
-                if self.a[i * n + k].abs() > self.a[pivot_row * n + k].abs() {
-                    pivot_row = i;
-                }
-            }
-            self.pivots.push(pivot_row);
-            if pivot_row != k {
-                let (upper, lower) = self.a.split_at_mut(pivot_row * n);
-                upper[k * n..(k + 1) * n].swap_with_slice(&mut lower[..n]);
-            }
-            let pivot = self.a[k * n + k];
-            largest = largest.max(pivot.abs());
-            smallest = smallest.min(pivot.abs());
-            let (upper, lower) = self.a.split_at_mut((k + 1) * n);
-            let row_k = &upper[k * n + k + 1..];
-            let reciprocal = 1.0 / pivot;
-            for row in lower.chunks_exact_mut(n) {
-                let factor = row[k] * reciprocal;
-                row[k] = factor;
-                // The matrices are sparse until fill-in.
-                if factor.to_bits() << 1 != 0 {
-                    for (a, b) in row[k + 1..].iter_mut().zip(row_k) {
-                        *a -= factor * b;
-                    }
-                }
-            }
-        }
-        if smallest > 0.0 && largest.is_finite() { largest / smallest } else { f64::INFINITY }
+    for i in 1..n {
+        let (known, rest) = b.split_at_mut(i);
+        rest[0] -= super::problem::dot(&a[i * n..i * n + i], known);
     }
+    for i in (0..n).rev() {
+        let (rest, known) = b.split_at_mut(i + 1);
+        let sum = super::problem::dot(&a[i * n + i + 1..(i + 1) * n], known);
+        rest[i] = (rest[i] - sum) / a[i * n + i];
+    }
+}
 
-    /// Solves `A x = b` in place.
-    pub(super) fn solve(&self, b: &mut [f64]) {
-        let n = self.n;
-        for (k, &p) in self.pivots.iter().enumerate() {
-            b.swap(k, p);
-        }
-        for i in 1..n {
-            let (known, rest) = b.split_at_mut(i);
-            rest[0] -= super::problem::dot(&self.a[i * n..i * n + i], known);
-        }
-        for i in (0..n).rev() {
-            let (rest, known) = b.split_at_mut(i + 1);
-            let sum = super::problem::dot(&self.a[i * n + i + 1..(i + 1) * n], known);
-            rest[i] = (rest[i] - sum) / self.a[i * n + i];
+/// Solves `A^T x = b` in place, likewise.
+pub(super) fn solve_transposed(a: &[f64], pivots: &[usize], b: &mut [f64]) {
+    let n = pivots.len();
+    for i in 0..n {
+        let value = b[i] / a[i * n + i];
+        b[i] = value;
+        for (j, x) in b.iter_mut().enumerate().skip(i + 1) {
+            *x -= a[i * n + j] * value;
         }
     }
-
-    /// Solves `A^T x = b` in place.
-    pub(super) fn solve_transposed(&self, b: &mut [f64]) {
-        let n = self.n;
-        for i in 0..n {
-            let value = b[i] / self.a[i * n + i];
-            b[i] = value;
-            for (j, x) in b.iter_mut().enumerate().skip(i + 1) {
-                *x -= self.a[i * n + j] * value;
-            }
+    for i in (1..n).rev() {
+        let value = b[i];
+        for (x, l) in b[..i].iter_mut().zip(&a[i * n..i * n + i]) {
+            *x -= l * value;
         }
-        for i in (1..n).rev() {
-            let value = b[i];
-            for (x, l) in b[..i].iter_mut().zip(&self.a[i * n..i * n + i]) {
-                *x -= l * value;
-            }
-        }
-        for (k, &p) in self.pivots.iter().enumerate().rev() {
-            b.swap(k, p);
-        }
+    }
+    for (k, &p) in pivots.iter().enumerate().rev() {
+        b.swap(k, p);
     }
 }
 

@@ -37,10 +37,6 @@ fn drive(sets: &[&str]) -> Vec<(i64, u64, usize, usize)> {
             out.clear();
             let counted = measure(|| estimator.handle(input, ArrivalTime(time.0), &Serial, &mut out));
             let windows = out.iter().filter(|output| matches!(output, Output::Window(_))).count();
-            // A member left to the general solver may be the first of which it has to take apart so large a block.
-            if out.iter().any(|output| matches!(output, Output::Window(window) if window.report.one_by_one > 0)) {
-                continue;
-            }
             told.push((time.0, counted.count_total, windows, out.len() - windows));
         }
     }
