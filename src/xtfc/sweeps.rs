@@ -216,8 +216,9 @@ pub struct Freedom<'a> {
     pub covariance: Covariance<'a>,
     /// Weights of the physics rows, per equation \[s/mmHg\].
     pub physics_weights: &'a [f64],
-    /// About the inverse covariance of the weighted samples, `[n_samples x n_samples]`; worked out member by member if
-    /// there is none. The better, the fewer rounds; the result does not depend on it.
+    /// About the inverse covariance of the weighted samples, `[n_samples x n_samples]`; if there is none, it is worked out
+    /// member by member where samples have to do with each other. The better, the fewer rounds; the result does not depend
+    /// on it.
     pub precision: Option<&'a [f64]>,
 }
 
@@ -404,8 +405,9 @@ impl<'a, M: LaneModel> Equations<'a, M> {
     fn look_ahead(&self, tangent: M::Tangent, at: &mut Tangents<'_, M>) {
         for (node, moment) in self.moments.iter().enumerate() {
             at.tangents.push(tangent);
-            at.relaxations.push(M::Relaxation::default());
-            M::relaxation(&self.fixed, moment, &tangent, self.phi(node)[node], &mut at.relaxations[node]);
+            let mut relaxation = M::Relaxation::default();
+            M::relaxation(&self.fixed, moment, &tangent, self.phi(node)[node], &mut relaxation);
+            at.relaxations.push(relaxation);
         }
     }
 
@@ -817,9 +819,6 @@ impl<M: LaneModel> pulp::NullaryFnOnce for Fit<'_, M> {
         scratch.begin(samples, freedom, &path, &solutions.theta);
         let (mut g, mut pulled, mut drive, mut held) = (AtNodes::new(), AtNodes::new(), AtNodes::new(), AtNodes::new());
         let mut dual = Dual::<M> { g: &mut g, pulled: &mut pulled, drive: &mut drive, held: &mut held };
-        if freedom.precision.is_none() {
-            scratch.guess(model, &equations, samples, freedom, (&mut dual, &at), &states, &solutions.theta);
-        }
         dual.rest(nodes);
         scratch.advance();
         let mut progress = Progress::NONE;
@@ -868,7 +867,13 @@ impl<M: LaneModel> pulp::NullaryFnOnce for Fit<'_, M> {
             if progress.done.iter().all(|done| *done) {
                 break;
             }
-            scratch.improve();
+            if progress.sweeps == 1 && freedom.precision.is_none() && !scratch.is_nearly_right() {
+                scratch.guess(model, &equations, samples, freedom, (&mut dual, &at), &states, &solutions.theta);
+                dual.rest(nodes);
+                scratch.advance();
+            } else {
+                scratch.improve();
+            }
         }
         #[allow(clippy::cast_precision_loss)]
         let count = (nodes * solutions.start.len()) as f64;
@@ -920,6 +925,9 @@ fn pull_back<M: LaneModel>(
 
 /// Of one: what a change of a parameter does to pressures of a hundred mmHg, sooner or later.
 const PER_CENT: f64 = 100.0;
+
+/// What a first step may leave for samples to be taken as being on their own.
+const NEARLY: f64 = 0.1;
 
 /// Sweeps through the dual equations that are good enough for a guess.
 const GUESS_SWEEPS: usize = 2;
@@ -1030,13 +1038,31 @@ impl FitScratch {
         self.gradient.resize(freedom.unknowns.len(path.start.as_ref().len()), Lanes::default());
         self.inverse.clear();
         self.inverse.resize(m * m, Lanes::default());
-        for (entry, precision) in self.inverse.iter_mut().zip(freedom.precision.into_iter().flatten()) {
-            *entry = Lanes::splat(*precision);
+        match freedom.precision {
+            Some(precision) => {
+                for (entry, precision) in self.inverse.iter_mut().zip(precision) {
+                    *entry = Lanes::splat(*precision);
+                }
+            }
+            // Samples that are less certain than what is expected of them: nearly so.
+            None => (0..m).for_each(|j| self.inverse[j * m + j] = Lanes::splat(1.0)),
         }
         for (j, &observed) in samples.states.iter().enumerate() {
             let expected = path.state_at(observed, samples.phi(j));
             self.off[j] = Lanes::splat(samples.weights[j]) * (expected - samples.values[j]);
         }
+    }
+
+    /// Whether the first step has left little of what it was to do away with. It was as long as that, if the samples were
+    /// taken to be on their own.
+    #[inline(always)]
+    fn is_nearly_right(&self) -> bool {
+        let (mut left, mut whole) = (Lanes::splat(0.0), Lanes::splat(0.0));
+        for (off, step) in self.off.iter().zip(&self.step) {
+            left = off.abs().larger(left);
+            whole = step.abs().larger(whole);
+        }
+        (left - whole * Lanes::splat(NEARLY)).all_within(0.0)
     }
 
     /// `step = inverse off`, taken.

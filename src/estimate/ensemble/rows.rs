@@ -15,7 +15,7 @@ impl<M: Model> Ensemble<M> {
 
     pub(in crate::estimate) fn read_rows_of(&self, batches: &[Batch], rows: &mut Vec<f64>) {
         let members: usize = batches.iter().map(Batch::len).sum();
-        rows.clear();
+        // All of them are written.
         rows.resize((self.model.n_states() + self.estimated.len()) * members, 0.0);
         let (estimated, transforms) = (&self.estimated, &self.transforms);
         self.settings.instructions.run(ReadRows { batches, members, estimated, transforms, rows });
