@@ -125,6 +125,8 @@ pub struct Batch {
     derived: Vec<Lanes>,
     scratch: FitScratch,
     one: One,
+    /// Whether the general solver has places for all that it needs.
+    has_room: bool,
 }
 
 /// A member on its own.
@@ -171,6 +173,7 @@ impl Batch {
             derived: Vec::new(),
             scratch: FitScratch::default(),
             one: One::default(),
+            has_room: false,
         };
         batch.renew();
         batch
@@ -276,6 +279,7 @@ impl Batch {
         self.begin(tools);
         self.locate(lesson.observations, tools.settings);
         self.hear(tools, lesson);
+        self.make_room(tools, lesson);
         let progress = self.by_kernel(tools, lesson, true);
         if progress.is_some() {
             self.conclude(tools, lesson, progress);
@@ -346,16 +350,31 @@ impl Batch {
         self.tally = Tally::default();
         let is_tried = progress.is_some();
         self.take(progress, |batch, lane| {
-            let data = lesson.observations.iter().enumerate().map(|(k, o)| Datum {
-                s: o.s,
-                state: batch.states[k],
-                value: batch.values[k].0[lane],
-                weight: batch.weights[k],
-            });
-            batch.one.data.clear();
-            batch.one.data.extend(data);
+            batch.tell_one(lane, lesson);
             batch.solve_one(tools, lane, Some(lesson), is_tried);
         });
+    }
+
+    /// The samples as one member hears them.
+    fn tell_one(&mut self, lane: usize, lesson: &Lesson<'_>) {
+        let data = lesson.observations.iter().enumerate().map(|(k, o)| Datum {
+            s: o.s,
+            state: self.states[k],
+            value: self.values[k].0[lane],
+            weight: self.weights[k],
+        });
+        self.one.data.clear();
+        self.one.data.extend(data);
+    }
+
+    /// Solves one member in vain, with the first lesson: there are places then for all that the general solver needs, and it
+    /// does not have to ask for them whenever a member is first left to it.
+    fn make_room<M: Model>(&mut self, tools: &Tools<'_, M>, lesson: &Lesson<'_>) {
+        if !std::mem::replace(&mut self.has_room, true) {
+            self.tell_one(0, lesson);
+            self.solve_one(tools, 0, Some(lesson), false);
+            self.begin(tools);
+        }
     }
 
     /// One member by the general solver, from where the kernel gave up if it `is_tried`; a forecast without a lesson.

@@ -413,6 +413,8 @@ impl Blocks {
         }
         self.states.clear();
         self.ends.clear();
+        // However many blocks there will be.
+        self.ends.reserve(n);
         for block in 0..n {
             let before = self.states.len();
             self.states.extend((0..n).filter(|&i| self.block_of[i] == block));

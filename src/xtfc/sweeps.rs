@@ -238,6 +238,7 @@ pub struct FitScratch {
     gradient: Vec<Lanes>,
     /// Derivatives of the weighted samples by what is free and by the errors of the equations.
     answers: Vec<Lanes>,
+    /// Prior mean of what is free of the parameters, `[n_parameters_free]`.
     mean_theta: Vec<Lanes>,
 }
 
@@ -1029,7 +1030,7 @@ impl FitScratch {
     ) {
         let m = samples.states.len();
         self.mean_theta.clear();
-        self.mean_theta.extend_from_slice(theta);
+        self.mean_theta.extend(freedom.unknowns.parameters.iter().map(|&p| theta[p]));
         for rows in [&mut self.residuals, &mut self.pulls, &mut self.off, &mut self.step, &mut self.along] {
             rows.clear();
             rows.resize(m, Lanes::default());
@@ -1140,8 +1141,8 @@ impl FitScratch {
             within = (Lanes::splat(unknowns.max_steps[k]) - shift.abs()).choose(within, Lanes::default());
             moved = (shift.abs() * Lanes::splat(PER_CENT)).larger(moved);
             solutions.theta[p] = match transform {
-                Transform::Log => self.mean_theta[p] * shift.exp(),
-                Transform::Linear { scale } => self.mean_theta[p] + shift * Lanes::splat(*scale),
+                Transform::Log => self.mean_theta[k] * shift.exp(),
+                Transform::Linear { scale } => self.mean_theta[k] + shift * Lanes::splat(*scale),
             };
         }
         let mut timed = false;

@@ -16,7 +16,7 @@ use hemostream::xtfc::collocation::CollocationSolver;
 use hemostream::xtfc::features::{FeatureSpec, RandomFeatures};
 use hemostream::xtfc::problem::{Datum, Prior, Solution, Stopping, Unknowns, WindowProblem};
 use hemostream::xtfc::sweeps::{
-    Covariance, Expressions, FitScratch, Freedom, Samples, Shared, Solutions, derive, fit, forecast,
+    Covariance, Expressions, FitScratch, Freedom, Samples, Shared, Solutions, derive, fit, forecast, forecast_and_fit,
 };
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -343,6 +343,60 @@ fn an_independent_window_is_that_of_the_general_solver() {
         println!("{length_s} s, {data_weight}: {:.2} % of the windows by sweeps", 100.0 * share);
         assert!(share >= least, "{length_s} {data_weight}: {share}");
     }
+}
+
+/// Forecast and fit are the same at once and one after the other, and so is what the forecast says of the samples.
+#[test]
+fn a_forecast_and_a_fit_at_once_are_both() {
+    let model = Cvsim6::default();
+    let (shared, set) = (all_their_own(model), InstructionSet::best());
+    let bases = bases(WIDTH, FeatureSpec::default(), 0.004);
+    let expressions = Expressions::new(&bases).unwrap();
+    let chosen = [Parameter::RPv as usize, Parameter::CA as usize, Parameter::HeartRate as usize];
+    let transforms: Vec<_> = chosen.iter().map(|&p| model.parameters()[p].transform).collect();
+    let unknowns = coupled_unknowns(&model, &chosen, &transforms);
+    let covariance: Vec<f64> = (0..81).map(|k| if k % 10 == 0 { 0.01 } else { 0.001 }).collect();
+    let freedom = Freedom {
+        unknowns: &unknowns,
+        covariance: Covariance::Shared(&covariance),
+        physics_weights: &WEIGHTS,
+        precision: None,
+    };
+    let (mut scratch, mut expected, mut compared) = (FitScratch::default(), Vec::new(), 0);
+    for step in 0..120 {
+        let case = Case::at(step);
+        let samples = [(0.3, State::A), (0.3, State::V), (1.0, State::Pa)];
+        let data = Data::new(&case, &bases, &samples, 2.0, |state| 1.0 / NOISE[state as usize]);
+        let samples = Samples { states: &data.states, weights: &data.weights, phi: &data.phi, values: &data.values };
+        let mut solutions = case.solutions();
+        let all = |done: [bool; WIDTH]| done.iter().all(|done| *done);
+        let whole = all(forecast(&shared, &expressions, 1e-11, set, &mut solutions).done);
+        let says = |j: usize| {
+            let (state, phi) = (data.states[j], &data.phi[j * 5..(j + 1) * 5]);
+            let beta = &solutions.beta[state * 5..(state + 1) * 5];
+            phi.iter().zip(beta).fold(solutions.start[state], |x, (phi, beta)| x + *phi * *beta)
+        };
+        let says: Vec<Lanes> = (0..3).map(says).collect();
+        let one_by_one = fit(&shared, &expressions, &samples, &freedom, 1e-11, set, (&mut scratch, &mut solutions));
+        let mut other = case.solutions();
+        let places = (&mut scratch, &mut other, &mut expected);
+        let at_once = forecast_and_fit(&shared, &expressions, &samples, &freedom, 1e-11, set, places);
+        assert_eq!(at_once.is_some(), whole, "given up if the forecast is");
+        let Some(at_once) = at_once else {
+            assert_eq!((&other.start, &other.theta), (&case.solutions().start, &case.solutions().theta));
+            continue;
+        };
+        for lane in (0..WIDTH).filter(|&lane| at_once.done[lane] && one_by_one.done[lane]) {
+            let of = |lanes: &[Lanes]| lanes.iter().map(|lanes| lanes.0[lane]).collect::<Vec<f64>>();
+            close(&expected, lane, &of(&says), 1e-9, "expected");
+            close(&other.end, lane, &of(&solutions.end), 1e-9, "state at the end");
+            close(&other.start, lane, &of(&solutions.start), 1e-9, "state at the start");
+            close(&other.theta, lane, &of(&solutions.theta), 1e-9, "parameter");
+            compared += 1;
+        }
+    }
+    println!("{compared} of {} member-windows compared", 120 * WIDTH);
+    assert!(compared > 100 * WIDTH, "{compared}");
 }
 
 #[test]

@@ -16,6 +16,7 @@ mod reproduce;
 mod service;
 mod stream;
 mod support;
+mod surprise;
 mod tidy;
 mod twin;
 mod validate;
