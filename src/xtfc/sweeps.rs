@@ -962,8 +962,6 @@ impl FitScratch {
     ) {
         let (m, n_u, nodes) = (samples.states.len(), self.gradient.len(), equations.nodes());
         let n = states[0].as_ref().len();
-        self.answers.clear();
-        self.answers.resize(m * (n_u + nodes * n), Lanes::default());
         let mut answers = std::mem::take(&mut self.answers);
         for (j, answer) in answers.chunks_exact_mut(n_u + nodes * n).enumerate() {
             let observed = samples.states[j];
@@ -1039,6 +1037,11 @@ impl FitScratch {
         self.gradient.resize(freedom.unknowns.len(path.start.as_ref().len()), Lanes::default());
         self.inverse.clear();
         self.inverse.resize(m * m, Lanes::default());
+        if freedom.precision.is_none() {
+            // A place for a guess, whether or not one will be needed.
+            let (n_u, n) = (self.gradient.len(), path.start.as_ref().len());
+            self.answers.resize(m * (n_u + path.slopes.len() * n), Lanes::default());
+        }
         match freedom.precision {
             Some(precision) => {
                 for (entry, precision) in self.inverse.iter_mut().zip(precision) {
