@@ -8,6 +8,8 @@
 //! |---|---|---|
 //! | `pressure/CHANNEL` | [`PressureBlock`] | in; JSON accepted with encoding `application/json` |
 //! | `beat` | [`Beats`] | in: onsets of beats, from an ECG |
+//! | `note` | [`Note`] | what an operator says; dashboards and recorders listen, the estimator does not |
+//! | `acknowledge` | [`Acknowledge`] | in: an operator has seen an alarm |
 //! | `truth` | [`Truth`] | what a synthetic patient really is; published by `replay` |
 //! | `estimate/state` | [`StateEstimate`] | |
 //! | `estimate/parameters` | [`ParameterEstimate`] | |
@@ -16,6 +18,7 @@
 //! | `estimate/members` | [`Members`] | only while someone subscribes |
 //! | `status` | [`Status`] | |
 //! | `event` | [`Event`] | |
+//! | `alarm` | [`Alarms`] | all alarms of the bed, whenever one of them changes |
 //!
 //! Each `out` key has a twin `KEY/json`. The JSON holds the same content, arranged by name (`names` keeps the order);
 //! numbers that JSON cannot hold (NaN, infinities) are `null`. The arrays are described in the types.
@@ -220,6 +223,67 @@ pub struct Event {
     pub text: String,
 }
 
+/// One alarm of a bed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Alarm {
+    /// Its name in the configuration.
+    pub name: String,
+    /// Quantity, parameter or clinical quantity it watches.
+    pub quantity: String,
+    /// Unit of `limit` and of the band.
+    pub unit: String,
+    /// `low`, `medium` or `high`.
+    pub priority: String,
+    /// `normal`, `pending` (beyond the limit, not yet long enough), `active`, or `latched` (it was active and nobody has
+    /// acknowledged it).
+    pub state: String,
+    /// Whether an operator has seen it; false unless it is active.
+    pub acknowledged: bool,
+    /// `below` or `above`.
+    pub side: String,
+    /// The limit.
+    pub limit: f64,
+    /// Event time since which it is in this state \[ns\].
+    pub since_ns: i64,
+    /// The band when it last changed: mean, 5 and 95 % quantile.
+    pub band: [f64; 3],
+    /// For people: what is the matter.
+    pub text: String,
+}
+
+/// What stands against the limits of a bed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Alarms {
+    /// Common start.
+    pub header: Header,
+    /// One per alarm of the configuration, in its order.
+    pub alarms: Vec<Alarm>,
+}
+
+/// An operator has seen an alarm.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Acknowledge {
+    /// [`SCHEMA`].
+    pub schema: u16,
+    /// Name of the alarm; empty for all of the bed.
+    pub alarm: String,
+    /// Who; for the record.
+    pub author: String,
+}
+
+/// What an operator says about a bed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Note {
+    /// [`SCHEMA`].
+    pub schema: u16,
+    /// Event time that it is about \[ns\].
+    pub time_ns: i64,
+    /// Who.
+    pub author: String,
+    /// What.
+    pub text: String,
+}
+
 /// What a synthetic patient really is.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Truth {
@@ -419,6 +483,12 @@ impl ToJson for Status {
 impl ToJson for Event {
     fn to_json(&self) -> Value {
         with_header(&self.header, json!({ "kind": self.kind, "channel": self.channel, "text": self.text }))
+    }
+}
+
+impl ToJson for Alarms {
+    fn to_json(&self) -> Value {
+        with_header(&self.header, json!({ "alarms": self.alarms }))
     }
 }
 
