@@ -1,6 +1,7 @@
 //! The commands: arguments, exit codes, and what is printed. The work is done by the library.
 
 mod config;
+mod dashboard;
 mod demo;
 mod estimate;
 mod replay;
@@ -38,6 +39,7 @@ enum Command {
     Serve(serve::Serve),
     Replay(replay::Replay),
     Watch(watch::Watch),
+    Dashboard(dashboard::Dashboard),
     Simulate(simulate::Simulate),
     Estimate(estimate::Estimate),
     Validate(validate::Validate),
@@ -130,6 +132,7 @@ pub(crate) fn main() -> ExitCode {
         Command::Serve(command) => command.run(),
         Command::Replay(command) => command.run(),
         Command::Watch(command) => command.run(),
+        Command::Dashboard(command) => command.run(),
         Command::Simulate(command) => command.run(),
         Command::Estimate(command) => command.run(),
         Command::Validate(command) => command.run(),

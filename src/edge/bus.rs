@@ -81,6 +81,11 @@ pub trait Bus: Send + Sync {
     /// When the key is invalid or the transport is closed. Congestion is not an error.
     fn publish(&self, message: Message, delivery: Delivery) -> Result<(), BusError>;
 
+    /// Whether there is a link to anybody else; true where there is nothing to be linked.
+    fn is_connected(&self) -> bool {
+        true
+    }
+
     /// Whether anyone subscribes to `key` now; true where the bus cannot know.
     fn is_wanted(&self, key: &str) -> bool;
 

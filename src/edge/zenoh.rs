@@ -131,6 +131,11 @@ impl Bus for ZenohBus {
         publisher.put(message.payload).encoding(to_zenoh(message.encoding)).wait().map_err(transport)
     }
 
+    fn is_connected(&self) -> bool {
+        let info = self.session.info();
+        info.routers_zid().wait().next().is_some() || info.peers_zid().wait().next().is_some()
+    }
+
     fn is_wanted(&self, key: &str) -> bool {
         let publisher = self.publisher(key, Delivery::Estimates);
         publisher.is_ok_and(|p| p.matching_status().wait().is_ok_and(|status| status.matching()))

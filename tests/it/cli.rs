@@ -231,7 +231,7 @@ fn bad_usage_and_bad_settings_exit_with_2() {
 
 #[test]
 fn every_command_has_help_with_an_example() {
-    for command in ["demo", "serve", "replay", "watch", "simulate", "estimate", "validate", "config"] {
+    for command in ["demo", "serve", "replay", "watch", "dashboard", "simulate", "estimate", "validate", "config"] {
         let output = hemostream(&[command, "--help"]);
         assert!(output.status.success());
         assert!(text(&output.stdout).contains(&format!("hemostream {command}")), "{command}");
@@ -250,10 +250,20 @@ fn config_prints_settings_with_their_origin() {
 /// Everything together over zenoh on loopback, on a port of its own.
 #[test]
 fn demo_runs_by_itself_and_sums_up() {
-    let output = hemostream(&["demo", "--seconds", "3", "--plain", "--set", "estimator.members=20"]);
+    let output = hemostream(&["demo", "--seconds", "3", "--listen", "127.0.0.1:0", "--set", "estimator.members=20"]);
     let printed = text(&output.stdout);
     assert!(output.status.success(), "{printed}{}", text(&output.stderr));
-    for expected in ["r_pv", "c_a", "p_pv [mmHg]", "coverage", "window lag p50", "(observed)"] {
+    for expected in [
+        "http://127.0.0.1:",
+        "icu-1",
+        "icu-3",
+        "r_pv",
+        "c_a",
+        "p_pv [mmHg]",
+        "coverage",
+        "window lag p50",
+        "(observed)",
+    ] {
         assert!(printed.contains(expected), "`{expected}` is not in: {printed}");
     }
     assert!(printed.contains("lost or refused: nothing"), "{printed}");

@@ -1,3 +1,11 @@
 //! Dashboards: pictures of what is on the bus, and nothing that is not on it.
+//!
+//! [`terminal`] and [`web`] show the same `ward`, which takes in messages, knows no clock and no screen, and grows
+//! without limit in nothing. `feed` brings the messages.
 
+mod bed;
+mod feed;
+mod history;
 pub mod terminal;
+mod ward;
+pub mod web;

@@ -6,13 +6,14 @@ use ratatui::buffer::Buffer;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
 
+use super::super::bed::{Bed, quantity_names};
+use super::super::ward::Ward;
 use super::panels::beat_reading;
 use super::paper::{panel, put};
 use super::style;
 use super::traces::reading;
 use super::ui::Ui;
 use super::view::badge;
-use super::ward::{Bed, Ward, quantity_names};
 
 const NAME_WIDTH: usize = 12;
 /// Of the longest state with its number.

@@ -1,11 +1,9 @@
 //! The terminal dashboard: a bedside monitor for every bed on the bus.
 //!
 //! [`run`] owns the terminal and asks the clock; `ward` is what is known, `ui` what is chosen, `view` a pure function
-//! of both. Deliberately absent: anything that is published. A watcher subscribes to what it shows and no more,
-//! so that neither JSON twins nor whole ensembles are sent on its account.
+//! of both. Deliberately absent: anything that is published.
 
 mod beds;
-mod history;
 mod panels;
 mod paper;
 mod style;
@@ -14,12 +12,11 @@ mod tests;
 mod traces;
 mod ui;
 mod view;
-mod ward;
 
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
+use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
 use std::thread;
 use std::time::Duration;
 
@@ -27,20 +24,19 @@ use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event};
 
 use self::ui::{Next, Ui};
-use self::ward::Ward;
-use crate::edge::bus::{Bus, BusError, Handler, Message, Subscription};
+use super::feed::{self, QUEUE, Topics};
+use super::ward::{Memory, Ward};
+use crate::edge::bus::{Bus, Message};
 use crate::runtime::clock::Clock;
 
-/// What is shown, under `PREFIX/BED/`.
-const TOPICS: [&str; 7] =
-    ["pressure/*", "estimate/state", "estimate/parameters", "estimate/beat", "truth", "status", "event"];
-/// Messages between the bus and the screen; more are dropped and counted.
-const QUEUE: usize = 16_384;
+/// Longest past of the waveforms \[s\].
+const HISTORY_S: i64 = 60;
+/// About 80 MB.
+const MEMORY: Memory = Memory { history_s: HISTORY_S, rows: 200_000 };
 /// Time between two pictures.
 const FRAME: Duration = Duration::from_millis(55);
 /// Longest work on messages between two pictures, so that keys are obeyed under any load.
 const SHARE: Duration = Duration::from_millis(30);
-const LAST_VALUES_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Shows the beds under `prefix`, `bed` first, until a key or `stop` ends it.
 ///
@@ -49,19 +45,19 @@ const LAST_VALUES_TIMEOUT: Duration = Duration::from_secs(1);
 pub fn run(bus: &dyn Bus, prefix: &str, bed: Option<&str>, stop: &AtomicBool) -> io::Result<()> {
     let dropped = Arc::new(AtomicU64::new(0));
     let (sender, receiver) = sync_channel(QUEUE);
-    let _subscriptions = subscribe(bus, prefix, &sender, &dropped).map_err(io::Error::other)?;
+    let _subscriptions = feed::subscribe(bus, prefix, Topics::All, &sender, &dropped).map_err(io::Error::other)?;
     let (last_sender, last_values) = sync_channel(1);
     thread::scope(|scope| {
         // Beside the screen, which does not wait for an answer that may never come.
         scope.spawn(move || {
-            let answer = bus.last_values(&format!("{prefix}/**"), LAST_VALUES_TIMEOUT);
-            let _ = last_sender.send(answer.unwrap_or_default());
+            let _ = last_sender.send(feed::last_values(bus, prefix));
         });
         let feed = Feed { receiver, last_values: Some(last_values), dropped };
         // Restores the terminal whichever way this ends.
         let _restore = Restore;
         let mut terminal = ratatui::try_init()?;
-        Screen { ward: Ward::new(prefix), ui: Ui::new(bed), feed, clock: Clock::start() }.run(&mut terminal, stop)
+        Screen { ward: Ward::new(prefix, MEMORY), ui: Ui::new(bed), feed, clock: Clock::start() }
+            .run(&mut terminal, stop)
     })
 }
 
@@ -71,23 +67,6 @@ impl Drop for Restore {
     fn drop(&mut self) {
         ratatui::restore();
     }
-}
-
-fn subscribe(
-    bus: &dyn Bus,
-    prefix: &str,
-    sender: &SyncSender<Message>,
-    dropped: &Arc<AtomicU64>,
-) -> Result<Vec<Subscription>, BusError> {
-    let handler: Handler = {
-        let (sender, dropped) = (sender.clone(), Arc::clone(dropped));
-        Arc::new(move |message| {
-            if sender.try_send(message).is_err() {
-                dropped.fetch_add(1, Ordering::Relaxed);
-            }
-        })
-    };
-    TOPICS.iter().map(|topic| bus.subscribe(&format!("{prefix}/*/{topic}"), Arc::clone(&handler))).collect()
 }
 
 /// Where messages come from.
@@ -164,33 +143,5 @@ impl Screen {
                 return Ok(Next::Continue);
             }
         }
-    }
-}
-
-#[cfg(test)]
-mod feed_tests {
-    use super::*;
-    use crate::edge::bus::{Delivery, Encoding, MemoryBus};
-
-    #[test]
-    fn nobody_makes_twins_or_ensembles_for_a_watcher_and_a_full_queue_is_counted() {
-        let (bus, dropped) = (MemoryBus::new(), Arc::new(AtomicU64::new(0)));
-        let (sender, receiver) = sync_channel(2);
-        let subscriptions = subscribe(&bus, "some/ward", &sender, &dropped).unwrap();
-        for wanted in
-            ["estimate/state", "estimate/parameters", "estimate/beat", "truth", "status", "event", "pressure/p_a"]
-        {
-            assert!(bus.is_wanted(&format!("some/ward/bed1/{wanted}")), "{wanted}");
-        }
-        for unwanted in ["estimate/state/json", "estimate/members", "status/json"] {
-            assert!(!bus.is_wanted(&format!("some/ward/bed1/{unwanted}")), "{unwanted}");
-        }
-        let message = Message { key: "some/ward/bed1/status".to_owned(), encoding: Encoding::Bincode, payload: vec![] };
-        for _ in 0..5 {
-            bus.publish(message.clone(), Delivery::Estimates).unwrap();
-        }
-        assert_eq!((receiver.try_iter().count(), dropped.load(Ordering::Relaxed)), (2, 3));
-        drop(subscriptions);
-        assert!(!bus.is_wanted("some/ward/bed1/status"));
     }
 }

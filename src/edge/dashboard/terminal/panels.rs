@@ -6,11 +6,12 @@ use ratatui::buffer::Buffer;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
 
+use super::super::bed::{Band, BeatReading, Bed, Parameter, UNINFORMED_AFTER_S, quantity_names, seconds};
+use super::super::ward::Ward;
 use super::paper::{DOTS_X, DOTS_Y, Ink, Raster, panel, put, put_right};
 use super::style::{self, count};
 use super::traces::reading;
 use super::ui::{Group, Ui};
-use super::ward::{Band, BeatReading, Bed, Parameter, Ward, quantity_names, seconds};
 use crate::edge::wire::{ChannelStatus, Status};
 
 /// Below this the gauge of a band says nothing.
@@ -23,14 +24,14 @@ const WIDTH_WITH_TREND_TITLE: u16 = 44;
 const GAUGE_AND_TREND: u16 = 26;
 /// Innovations beyond this factor of what is expected are marked.
 const MISFIT: f64 = 1.5;
-/// A parameter that the data have said nothing about for so long is marked \[s\].
-const UNINFORMED_AFTER_S: f64 = 5.0;
 /// Status is sent once a second; older than this, it is marked.
 const STATUS_OVERDUE: Duration = Duration::from_secs(3);
 
 /// Events that say that all is well, or well again.
 const GOOD_EVENTS: [&str; 5] = ["start", "recovered", "artefact_over", "model_fits", "beat_found"];
 
+/// How far back a trend goes \[ns\].
+const TREND_NS: i64 = 120_000_000_000;
 /// How far back the axis of a gauge looks \[ns\].
 const GAUGE_LOOK_BACK_NS: i64 = 30_000_000_000;
 
@@ -194,7 +195,7 @@ fn draw_beside(buf: &mut Buffer, area: Rect, parameter: &Parameter, truth: Optio
 /// The extreme tenths of the past may leave the picture, or else a wide first guess would rule it for minutes.
 fn range(parameter: &Parameter, from_ns: i64, truth: Option<f64>) -> Option<(f64, f64)> {
     let past = |bound: fn(&Band) -> f32| {
-        let mut values: Vec<f64> = parameter.trend.since(from_ns).map(|(_, b)| f64::from(bound(b))).collect();
+        let mut values: Vec<f64> = parameter.trend.since(from_ns).map(|(_, b)| f64::from(bound(&b.band))).collect();
         values.sort_by(f64::total_cmp);
         values
     };
@@ -230,16 +231,17 @@ fn draw_gauge(buf: &mut Buffer, area: Rect, parameter: &Parameter, truth: Option
 
 /// Mean and band of the last two minutes.
 fn draw_trend(buf: &mut Buffer, area: Rect, parameter: &Parameter) {
-    let (Some((low, high)), Some(newest_ns)) = (range(parameter, i64::MIN, None), parameter.trend.newest_ns()) else {
-        return;
-    };
-    let oldest_ns = parameter.trend.since(i64::MIN).next().map_or(newest_ns, |(t, _)| t);
+    let Some(newest_ns) = parameter.trend.newest_ns() else { return };
+    let from_ns = newest_ns.saturating_sub(TREND_NS);
+    let Some((low, high)) = range(parameter, from_ns, None) else { return };
+    let oldest_ns = parameter.trend.since(from_ns).next().map_or(newest_ns, |(t, _)| t);
     let (dots_x, dots_y) = (i64::from(area.width * DOTS_X), f64::from(area.height * DOTS_Y));
     let span_s = seconds(newest_ns.saturating_sub(oldest_ns)).max(1.0);
     let mut raster = Raster::new(area.width, area.height);
     let y = |v: f32| ((high - f64::from(v)) / (high - low) * (dots_y - 1.0)).round() as i64;
     let mut drawn = -1;
-    for (t, band) in parameter.trend.since(i64::MIN) {
+    for (t, point) in parameter.trend.since(from_ns) {
+        let band = point.band;
         let x = (seconds(t.saturating_sub(oldest_ns)) / span_s * (dots_x - 1) as f64) as i64;
         for column in drawn + 1..=x {
             raster.column(Ink::Band, column, y(band.high), y(band.low));

@@ -94,7 +94,7 @@ pub(super) fn duration(seconds: f64) -> String {
 pub(super) fn event_time(time_ns: i64) -> String {
     const YEAR_2001_NS: i64 = 1_000_000_000_000_000_000;
     if time_ns < YEAR_2001_NS {
-        return format!("{:.1} s", super::ward::seconds(time_ns));
+        return format!("{:.1} s", super::super::bed::seconds(time_ns));
     }
     let tenths = time_ns / 100_000_000;
     let (second, tenth) = (tenths / 10 % 86_400, tenths % 10);

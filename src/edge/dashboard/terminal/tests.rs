@@ -6,9 +6,11 @@ use ratatui::Terminal;
 use ratatui::backend::TestBackend;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
+use super::super::bed::{Liveness, Origin};
+use super::super::ward::{MAX_BEDS, Ward};
+use super::MEMORY;
 use super::ui::{Next, Ui};
 use super::view;
-use super::ward::{Liveness, MAX_BEDS, Origin, Ward};
 use crate::edge::bus::{Encoding, Message};
 use crate::edge::wire::{
     self, BeatEstimate, ChannelStatus, Event, Header, PARAMETER_STATISTICS, ParameterEstimate, PressureBlock, SCHEMA,
@@ -148,7 +150,7 @@ fn fill(ward: &mut Ward, bed: &str) {
 }
 
 fn filled() -> Ward {
-    let mut ward = Ward::new("ward");
+    let mut ward = Ward::new("ward", MEMORY);
     fill(&mut ward, "bed1");
     ward
 }
@@ -208,7 +210,7 @@ fn the_last_beat_is_on_the_screen_and_cardiac_output_in_the_header_and_the_list(
 
 #[test]
 fn what_the_data_do_not_say_is_grey_and_marked() {
-    let mut ward = Ward::new("ward");
+    let mut ward = Ward::new("ward", MEMORY);
     ward.apply(&state("bed1", 0, 0.0), SECOND);
     let mut estimate: ParameterEstimate = wire::decode(&parameters("bed1", 0).payload, Encoding::Bincode).unwrap();
     *estimate.values.last_mut().unwrap() = 0.0;
@@ -261,7 +263,7 @@ fn pressures_without_estimates_and_estimates_without_pressures_are_told_apart() 
 
 #[test]
 fn last_values_are_shown_but_are_no_sign_of_life() {
-    let mut ward = Ward::new("ward");
+    let mut ward = Ward::new("ward", MEMORY);
     ward.apply_last_value(&state("bed1", 0, 0.0));
     assert_eq!(ward.beds["bed1"].liveness(SECOND), Liveness::NotHeard);
     assert_shows(&screen(&ward, &Ui::new(None), SECOND, (80, 24)), &["STALE last values", "70.0 ±4.0"]);
@@ -271,7 +273,7 @@ fn last_values_are_shown_but_are_no_sign_of_life() {
 
 #[test]
 fn an_estimate_that_lags_is_compared_with_the_truth_of_its_time_and_called_late() {
-    let mut ward = Ward::new("ward");
+    let mut ward = Ward::new("ward", MEMORY);
     for i in 0..100 {
         let (t, now) = (i * 20 * MS, Duration::from_millis(20 * i.unsigned_abs()));
         ward.apply(&truth("bed1", t), now);
@@ -288,7 +290,7 @@ fn an_estimate_that_lags_is_compared_with_the_truth_of_its_time_and_called_late(
 
 #[test]
 fn an_event_that_arrives_twice_is_shown_once() {
-    let mut ward = Ward::new("ward");
+    let mut ward = Ward::new("ward", MEMORY);
     ward.apply_last_value(&event("bed1", 0, "again"));
     ward.apply(&event("bed1", 0, "again"), SECOND);
     assert_eq!(ward.beds["bed1"].events.len(), 1);
@@ -296,7 +298,7 @@ fn an_event_that_arrives_twice_is_shown_once() {
 
 #[test]
 fn garbage_is_counted_and_makes_no_bed() {
-    let mut ward = Ward::new("ward");
+    let mut ward = Ward::new("ward", MEMORY);
     let topics = ["estimate/state", "estimate/parameters", "estimate/beat", "status", "event", "truth", "pressure/p_a"];
     for topic in topics {
         for payload in [vec![], vec![1], vec![1, 0, 255], vec![0xff; 300], vec![9, 0, 0, 0]] {
@@ -317,7 +319,7 @@ fn garbage_is_counted_and_makes_no_bed() {
 
 #[test]
 fn tables_whose_lengths_disagree_are_unreadable() {
-    let mut ward = Ward::new("ward");
+    let mut ward = Ward::new("ward", MEMORY);
     let header = header(0);
     let state = StateEstimate {
         header: header.clone(),
@@ -337,7 +339,7 @@ fn tables_whose_lengths_disagree_are_unreadable() {
 
 #[test]
 fn numbers_that_are_none_are_drawn_as_none() {
-    let mut ward = Ward::new("ward");
+    let mut ward = Ward::new("ward", MEMORY);
     for (i, value) in (0..).zip([f64::NAN, f64::INFINITY, -1e300, 1e300]) {
         let state = StateEstimate {
             header: header(0),
@@ -374,7 +376,7 @@ fn any_size_is_drawn_without_fault() {
 
 #[test]
 fn a_million_messages_leave_a_bounded_past() {
-    let mut ward = Ward::new("ward");
+    let mut ward = Ward::new("ward", MEMORY);
     let (state, samples, truth) = (state("bed1", 0, 0.0), samples("bed1", "p_a", 0), truth("bed1", 0));
     // Times are patched into ready bytes: encoding a million states is not the subject.
     let retime = |message: &Message, at: usize, t: i64| {
@@ -403,7 +405,7 @@ fn a_million_messages_leave_a_bounded_past() {
 
 #[test]
 fn beds_names_and_events_are_limited() {
-    let mut ward = Ward::new("ward");
+    let mut ward = Ward::new("ward", MEMORY);
     for i in 0..MAX_BEDS + 5 {
         ward.apply(&state(&format!("bed{i:04}"), 0, 0.0), SECOND);
     }

@@ -7,10 +7,10 @@ use ratatui::layout::Rect;
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 
+use super::super::bed::{Band, Bed, FORECAST_AFTER_S, Liveness, Origin, quantity_names};
 use super::paper::{DOTS_X, DOTS_Y, Ink, Raster, panel, put, put_right};
 use super::style;
 use super::ui::Group;
-use super::ward::{Band, Bed, FORECAST_AFTER_S, Liveness, Origin, quantity_names};
 
 /// Room for the numbers at the ends of the vertical axis.
 const LABEL_WIDTH: u16 = 5;

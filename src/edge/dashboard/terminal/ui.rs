@@ -5,7 +5,9 @@ use std::time::Duration;
 
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
-use super::ward::{Bed, HISTORY_S, Ward};
+use super::super::bed::Bed;
+use super::super::ward::Ward;
+use super::HISTORY_S;
 use crate::model::cvsim6::Pressures;
 
 /// Time spans to choose from \[s\].

@@ -8,9 +8,10 @@ use ratatui::layout::Rect;
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 
+use super::super::bed::{Bed, FORECAST_AFTER_S, Liveness};
+use super::super::ward::Ward;
 use super::paper::{put, put_right};
 use super::ui::Ui;
-use super::ward::{Bed, FORECAST_AFTER_S, Liveness, Ward};
 use super::{beds, panels, style, traces};
 
 const LEAST_WIDTH: u16 = 40;

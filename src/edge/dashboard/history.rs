@@ -20,12 +20,13 @@ pub(super) struct Limits {
 #[derive(Debug, Clone)]
 pub(super) struct History<T> {
     rows: VecDeque<(i64, T)>,
+    restarts: u64,
 }
 
 // Derived, it would ask for `T: Default`.
 impl<T> Default for History<T> {
     fn default() -> Self {
-        Self { rows: VecDeque::new() }
+        Self { rows: VecDeque::new(), restarts: 0 }
     }
 }
 
@@ -35,6 +36,7 @@ impl<T> History<T> {
         if let Some(newest_ns) = self.newest_ns() {
             if time_ns < newest_ns.saturating_sub(REORDERING_NS) {
                 self.rows.clear();
+                self.restarts += 1;
             }
             let at = self.rows.partition_point(|(t, _)| *t < time_ns);
             if self.is_dense_at(at, time_ns, limits.spacing_ns) {
@@ -62,6 +64,17 @@ impl<T> History<T> {
     /// Event time of the newest row.
     pub(super) fn newest_ns(&self) -> Option<i64> {
         self.rows.back().map(|(t, _)| *t)
+    }
+
+    /// How often the source began anew.
+    pub(super) fn restarts(&self) -> u64 {
+        self.restarts
+    }
+
+    /// The rows after `time_ns`.
+    pub(super) fn after(&self, time_ns: i64) -> impl DoubleEndedIterator<Item = (i64, &T)> + Clone {
+        let first = self.rows.partition_point(|(t, _)| *t <= time_ns);
+        self.rows.range(first..).map(|(t, row)| (*t, row))
     }
 
     /// Number of rows.

@@ -1,45 +1,40 @@
-//! What the screen knows: the beds heard so far and the recent past of each.
-//!
-//! Nothing here grows without a limit, whatever arrives: beds, rows, names and texts are capped, and what cannot
-//! be understood is counted. Time is an argument.
+//! A bed as a dashboard knows it: what it says now, and its recent past.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use super::history::{History, Limits};
-use crate::edge::bus::{Encoding, Message};
+use super::ward::{Content, MAX_NAME};
 use crate::edge::wire::{
-    self, BEAT_STATISTICS, BeatEstimate, ChannelStatus, Event, Header, PARAMETER_STATISTICS, ParameterEstimate,
-    PressureBlock, STATE_STATISTICS, StateEstimate, Status, Truth,
+    Alarm, Alarms, BEAT_STATISTICS, BeatEstimate, ChannelStatus, Event, Header, Note, PARAMETER_STATISTICS,
+    ParameterEstimate, PressureBlock, STATE_STATISTICS, StateEstimate, Status, Truth,
 };
 use crate::model::cvsim6::{FlowsAndVolumes, PARAMETERS, Pressures};
 
-/// Beds that are shown; further ones are counted.
-pub(super) const MAX_BEDS: usize = 1000;
 /// Pressures, flows and volumes.
 pub(super) const QUANTITIES: usize = Pressures::LEN + FlowsAndVolumes::LEN;
 /// Nothing for this long, and a bed is stale.
 pub(super) const STALE_AFTER: Duration = Duration::from_secs(2);
 /// An estimate this long without data is called a forecast \[s\].
 pub(super) const FORECAST_AFTER_S: f64 = 0.25;
+/// A parameter that the data have said nothing about for so long is uninformed \[s\].
+pub(super) const UNINFORMED_AFTER_S: f64 = 5.0;
 
 /// A beat that ended longer ago is not the present one.
 const PRESENT_BEAT_NS: i64 = 4 * NS_PER_S;
 
-/// Longest past of the waveforms \[s\].
-pub(super) const HISTORY_S: i64 = 60;
 const NS_PER_S: i64 = 1_000_000_000;
-/// 8 ms, finer than a dot of the widest terminal at a few seconds across.
-const SPACING_NS: i64 = NS_PER_S / 125;
-/// Rows of all beds together: about 80 MB.
-const ROW_BUDGET: usize = 200_000;
-/// The trend of a parameter: two minutes of seconds.
-const TREND: Limits = Limits { age_ns: 120 * NS_PER_S, spacing_ns: NS_PER_S, rows: 121 };
+/// Trends of parameters: ten minutes of seconds.
+const TREND: Limits = Limits { age_ns: 600 * NS_PER_S, spacing_ns: NS_PER_S, rows: 601 };
+/// Trends of what a beat is told by: ten minutes, of slow beats all of them.
+const BEAT_TREND: Limits = Limits { spacing_ns: NS_PER_S / 4, rows: 1201, ..TREND };
+/// Samples come more often than estimates are published.
+const SAMPLES_PER_ROW: usize = 3;
 const MAX_PARAMETERS: usize = 64;
 const MAX_EVENTS: usize = 200;
 const MAX_STATUS_ENTRIES: usize = 32;
+const MAX_ALARMS: usize = 64;
 const MAX_TEXT: usize = 200;
-const MAX_NAME: usize = 40;
 
 /// Monitor labels of the six pressures, apart from their own names.
 const LABELS: [&[&str]; Pressures::LEN] =
@@ -74,7 +69,15 @@ pub(super) struct Parameter {
     pub(super) since_informed_s: f64,
     /// Whether data rather than settings say what it is.
     pub(super) is_identifiable: bool,
-    pub(super) trend: History<Band>,
+    pub(super) trend: History<TrendPoint>,
+}
+
+/// A parameter at one time.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct TrendPoint {
+    pub(super) band: Band,
+    /// Whether the data said something about it then.
+    pub(super) is_informed: bool,
 }
 
 /// A clinical quantity of a heart beat.
@@ -83,6 +86,28 @@ pub(super) struct BeatReading {
     pub(super) name: String,
     pub(super) unit: String,
     pub(super) band: Band,
+}
+
+/// Standard deviations of a quantity by their source.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Spread {
+    pub(super) total: f64,
+    pub(super) epistemic: f64,
+    pub(super) aleatoric: f64,
+    pub(super) model: f64,
+}
+
+/// How far the estimates of a bed can be trusted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Quality {
+    /// The daemon has not said.
+    Unknown,
+    /// All sensors deliver, and the model fits them.
+    Good,
+    /// Something is amiss.
+    Degraded,
+    /// No sensor delivers anything of use.
+    Bad,
 }
 
 /// A line of the event log.
@@ -134,6 +159,8 @@ pub(super) struct Bed {
     /// The newest estimate in event time.
     pub(super) state: Option<(i64, StateRow)>,
     pub(super) history: History<StateRow>,
+    /// Of the newest estimate.
+    pub(super) spread: Vec<Spread>,
     /// Raw samples of the six pressures.
     pub(super) samples: [History<f32>; Pressures::LEN],
     /// What a synthetic patient really is; NaN where not published.
@@ -142,35 +169,16 @@ pub(super) struct Bed {
     pub(super) parameters: Vec<Parameter>,
     /// Of the last beat that was over, and when it was \[ns\].
     beat: (i64, Vec<BeatReading>),
+    /// The same over the last minutes, by name.
+    pub(super) beat_trends: BTreeMap<String, History<Band>>,
+    pub(super) alarms: Vec<Alarm>,
     pub(super) status: Option<Status>,
     pub(super) events: VecDeque<EventLine>,
+    /// Events ever taken in, so that a reader knows which are new to it.
+    pub(super) events_taken: u64,
     estimate_arrival: Option<Duration>,
     sample_arrival: Option<Duration>,
     pub(super) status_arrival: Option<Duration>,
-}
-
-/// All beds under a prefix.
-#[derive(Debug)]
-pub(super) struct Ward {
-    prefix: String,
-    pub(super) beds: BTreeMap<String, Bed>,
-    /// Messages of the kinds shown here.
-    pub(super) messages: u64,
-    /// Of these, not understood.
-    pub(super) unreadable: u64,
-    /// Of these, from beds beyond [`MAX_BEDS`].
-    pub(super) refused: u64,
-}
-
-/// A message that passed every check of its shape.
-enum Content {
-    State(StateEstimate),
-    Parameters(ParameterEstimate),
-    Beat(BeatEstimate),
-    Status(Status),
-    Event(Event),
-    Truth(Truth),
-    Samples(usize, PressureBlock),
 }
 
 /// Names of the quantities in their order here.
@@ -178,11 +186,13 @@ pub(super) fn quantity_names() -> impl Iterator<Item = &'static str> {
     Pressures::NAMES.iter().chain(FlowsAndVolumes::NAMES).copied()
 }
 
-fn quantity(name: &str) -> Option<usize> {
+/// Where a quantity stands in that order.
+pub(super) fn quantity(name: &str) -> Option<usize> {
     quantity_names().position(|n| n == name)
 }
 
-fn channel(label: &str) -> Option<usize> {
+/// The pressure that a channel label stands for.
+pub(super) fn channel(label: &str) -> Option<usize> {
     let by_label = || LABELS.iter().position(|labels| labels.iter().any(|l| l.eq_ignore_ascii_case(label)));
     Pressures::NAMES.iter().position(|n| *n == label).or_else(by_label)
 }
@@ -192,6 +202,11 @@ fn statistic(names: &[&str], row: &[f64], name: &str) -> f64 {
     names.iter().zip(row).find(|(n, _)| **n == name).map_or(f64::NAN, |(_, value)| *value)
 }
 
+/// Text of others: short, and without what could steer the terminal.
+pub(super) fn tame(text: &str, longest: usize) -> String {
+    text.chars().take(longest).map(|c| if c.is_control() { ' ' } else { c }).collect()
+}
+
 impl Band {
     fn from_row(names: &[&str], row: &[f64]) -> Self {
         let narrow = |name| statistic(names, row, name) as f32;
@@ -199,110 +214,8 @@ impl Band {
     }
 }
 
-/// Text of others: short, and without what could steer the terminal.
-fn tame(text: &str, longest: usize) -> String {
-    text.chars().take(longest).map(|c| if c.is_control() { ' ' } else { c }).collect()
-}
-
-impl Content {
-    /// `None` for topics that are not shown.
-    fn read(topic: &str, message: &Message) -> Option<Result<Self, ()>> {
-        let Message { payload, encoding, .. } = message;
-        if let Some(label) = topic.strip_prefix("pressure/") {
-            let channel = channel(label)?;
-            return Some(wire::decode(payload, *encoding).map(|b| Self::Samples(channel, b)).map_err(drop));
-        }
-        if *encoding != Encoding::Bincode {
-            return None;
-        }
-        let read = match topic {
-            "estimate/state" => wire::decode(payload, *encoding).map(Self::State),
-            "estimate/parameters" => wire::decode(payload, *encoding).map(Self::Parameters),
-            "estimate/beat" => wire::decode(payload, *encoding).map(Self::Beat),
-            "status" => wire::decode(payload, *encoding).map(Self::Status),
-            "event" => wire::decode(payload, *encoding).map(Self::Event),
-            "truth" => wire::decode(payload, *encoding).map(Self::Truth),
-            _ => return None,
-        };
-        Some(read.ok().filter(Self::is_consistent).ok_or(()))
-    }
-
-    /// Whether the lengths of the tables agree.
-    fn is_consistent(&self) -> bool {
-        let product = |a: usize, b: usize| a.checked_mul(b);
-        match self {
-            Self::State(s) => {
-                let cells = product(s.times_ns.len(), s.names.len()).and_then(|n| product(n, STATE_STATISTICS.len()));
-                cells == Some(s.values.len()) && s.since_data_s.len() == s.times_ns.len() && !s.names.is_empty()
-            }
-            Self::Parameters(p) => product(p.names.len(), PARAMETER_STATISTICS.len()) == Some(p.values.len()),
-            Self::Beat(b) => {
-                product(b.names.len(), BEAT_STATISTICS.len()) == Some(b.values.len()) && b.units.len() == b.names.len()
-            }
-            Self::Truth(t) => t.names.len() == t.values.len(),
-            Self::Samples(_, b) => b.offsets_ns.is_empty() || b.offsets_ns.len() == b.values.len(),
-            Self::Status(_) | Self::Event(_) => true,
-        }
-    }
-}
-
-impl Ward {
-    /// An empty ward; `prefix` is the common start of the keys.
-    pub(super) fn new(prefix: &str) -> Self {
-        let prefix = prefix.trim_end_matches('/').to_owned();
-        Self { prefix, beds: BTreeMap::new(), messages: 0, unreadable: 0, refused: 0 }
-    }
-
-    /// Takes in a message that arrived just now.
-    pub(super) fn apply(&mut self, message: &Message, now: Duration) {
-        self.take(message, Some(now));
-    }
-
-    /// Takes in a value from before: it is shown, but is no sign of life.
-    pub(super) fn apply_last_value(&mut self, message: &Message) {
-        self.take(message, None);
-    }
-
-    fn take(&mut self, message: &Message, arrival: Option<Duration>) {
-        let below_prefix = message.key.strip_prefix(&self.prefix).and_then(|rest| rest.strip_prefix('/'));
-        let Some((name, topic)) = below_prefix.and_then(|rest| rest.split_once('/')) else { return };
-        let Some(content) = Content::read(topic, message) else { return };
-        self.messages += 1;
-        // Read before the bed is made: noise under a new name is no bed.
-        let Ok(content) = content else {
-            self.unreadable += 1;
-            return;
-        };
-        let name = tame(name, MAX_NAME);
-        let is_new = !self.beds.contains_key(&name);
-        if is_new && self.beds.len() >= MAX_BEDS {
-            self.refused += 1;
-            return;
-        }
-        let beds = self.beds.len() + usize::from(is_new);
-        self.beds.entry(name).or_default().take(content, arrival, waveform_limits(beds));
-    }
-
-    /// Where `bed` stands among the beds in order of name, counted from 0.
-    pub(super) fn position(&self, bed: &str) -> Option<usize> {
-        self.beds.keys().position(|name| name == bed)
-    }
-
-    /// The common start of the keys.
-    pub(super) fn prefix(&self) -> &str {
-        &self.prefix
-    }
-}
-
-/// The limits of the waveforms, given how many beds share the memory.
-fn waveform_limits(beds: usize) -> Limits {
-    let longest = usize::try_from(HISTORY_S * NS_PER_S / SPACING_NS).unwrap_or(usize::MAX);
-    let rows = longest.min(ROW_BUDGET / beds.max(1));
-    Limits { age_ns: HISTORY_S * NS_PER_S, spacing_ns: SPACING_NS, rows }
-}
-
 impl Bed {
-    fn take(&mut self, content: Content, arrival: Option<Duration>, limits: Limits) {
+    pub(super) fn take(&mut self, content: Content, arrival: Option<Duration>, limits: Limits) {
         match content {
             Content::State(state) => {
                 self.estimate_arrival = arrival.or(self.estimate_arrival);
@@ -320,6 +233,8 @@ impl Bed {
                 self.status = Some(tame_status(status));
             }
             Content::Event(event) => self.take_event(&event),
+            Content::Alarms(alarms) => self.take_alarms(alarms),
+            Content::Note(note) => self.take_note(&note),
         }
     }
 
@@ -333,16 +248,18 @@ impl Bed {
                     bands[*q] = Band::from_row(&STATE_STATISTICS, statistics);
                 }
             }
-            let row = StateRow { bands, since_data_s };
-            self.history.push(time_ns, row.clone(), limits);
+            let state_row = StateRow { bands, since_data_s };
+            self.history.push(time_ns, state_row.clone(), limits);
             // The history thins out and forgets after a jump back: its end decides what is newest.
             if self.history.newest_ns().is_none_or(|newest| time_ns >= newest) {
-                self.state = Some((time_ns, row));
+                self.state = Some((time_ns, state_row));
+                self.spread = spread(&columns, row);
             }
         }
     }
 
     fn take_samples(&mut self, channel: usize, block: &PressureBlock, limits: Limits) {
+        let limits = Limits { rows: limits.rows.saturating_mul(SAMPLES_PER_ROW), ..limits };
         for (i, value) in block.values.iter().enumerate() {
             let regular = || block.period_ns.saturating_mul(i64::try_from(i).unwrap_or(i64::MAX));
             let offset_ns = block.offsets_ns.get(i).copied().unwrap_or_else(regular);
@@ -374,14 +291,32 @@ impl Bed {
             band: Band::from_row(&BEAT_STATISTICS, row),
         };
         self.beat = (beat.end_ns, rows.take(MAX_PARAMETERS).map(reading).collect());
+        for BeatReading { name, band, .. } in &self.beat.1 {
+            if let Some(trend) = self.beat_trends.get_mut(name) {
+                trend.push(beat.end_ns, *band, BEAT_TREND);
+            } else if self.beat_trends.len() < MAX_PARAMETERS {
+                self.beat_trends.entry(name.clone()).or_default().push(beat.end_ns, *band, BEAT_TREND);
+            }
+        }
+    }
+
+    /// All clinical quantities of the last beat, on the same condition.
+    pub(super) fn beat(&self) -> &[BeatReading] {
+        if self.is_beating() { &self.beat.1 } else { &[] }
+    }
+
+    fn is_beating(&self) -> bool {
+        self.history.newest_ns().is_some_and(|now_ns| now_ns.saturating_sub(self.beat.0) <= PRESENT_BEAT_NS)
     }
 
     /// A clinical quantity of the last beat, unless that was long ago: what does not beat has no output.
     pub(super) fn of_beat(&self, name: &str) -> Option<&BeatReading> {
-        let (end_ns, readings) = &self.beat;
-        let is_present = |now_ns: &i64| now_ns.saturating_sub(*end_ns) <= PRESENT_BEAT_NS;
-        self.history.newest_ns().filter(is_present)?;
-        readings.iter().find(|reading| reading.name == name)
+        self.beat().iter().find(|reading| reading.name == name)
+    }
+
+    /// Unit of a clinical quantity, as the last beat told it.
+    pub(super) fn beat_unit(&self, name: &str) -> &str {
+        self.beat.1.iter().find(|reading| reading.name == name).map_or("", |reading| &reading.unit)
     }
 
     /// Whether beats are told.
@@ -406,15 +341,66 @@ impl Bed {
     fn take_event(&mut self, event: &Event) {
         let [kind, channel] = [&event.kind, &event.channel].map(|s| tame(s, MAX_NAME));
         let Header { time_ns, sequence, .. } = event.header;
-        let line = EventLine { time_ns, sequence, kind, channel, text: tame(&event.text, MAX_TEXT) };
+        self.log(EventLine { time_ns, sequence, kind, channel, text: tame(&event.text, MAX_TEXT) });
+    }
+
+    /// A note stands among the events.
+    fn take_note(&mut self, note: &Note) {
+        let text = match tame(&note.author, MAX_NAME) {
+            author if author.trim().is_empty() => tame(&note.text, MAX_TEXT),
+            author => format!("{} ({author})", tame(&note.text, MAX_TEXT)),
+        };
+        let (kind, channel) = ("note".to_owned(), String::new());
+        self.log(EventLine { time_ns: note.time_ns, sequence: 0, kind, channel, text });
+    }
+
+    fn log(&mut self, line: EventLine) {
         // A last value may arrive a second time as news.
         if self.events.contains(&line) {
             return;
         }
         self.events.push_back(line);
+        self.events_taken += 1;
         if self.events.len() > MAX_EVENTS {
             self.events.pop_front();
         }
+    }
+
+    fn take_alarms(&mut self, alarms: Alarms) {
+        self.alarms = alarms.alarms;
+        self.alarms.truncate(MAX_ALARMS);
+        for Alarm { name, quantity, unit, priority, state, side, text, .. } in &mut self.alarms {
+            for short in [name, quantity, unit, priority, state, side] {
+                *short = tame(short, MAX_NAME);
+            }
+            *text = tame(text, MAX_TEXT);
+        }
+    }
+
+    /// How far the estimates can be trusted, and why not further.
+    pub(super) fn quality(&self) -> (Quality, String) {
+        let Some(status) = &self.status else { return (Quality::Unknown, "no status".to_owned()) };
+        let trouble = |c: &ChannelStatus| match c.state.as_str() {
+            "live" if !c.artefact.is_empty() => Some(format!("{} set aside: {}", c.name, c.artefact)),
+            "live" => None,
+            state => Some(format!("{} {}", c.name, if state == "never" { "never heard" } else { state })),
+        };
+        let unusable: Vec<String> = status.channels.iter().filter_map(trouble).collect();
+        let misfit = status.channels.iter().filter(|c| c.misfit).map(|c| format!("the model does not fit {}", c.name));
+        let few = (status.members_alive < status.members)
+            .then(|| format!("{} of {} members", status.members_alive, status.members));
+        let all: Vec<String> = unusable.iter().cloned().chain(misfit).chain(few).collect();
+        let quality = match () {
+            () if unusable.len() >= status.channels.len() => Quality::Bad,
+            () if !all.is_empty() => Quality::Degraded,
+            () => Quality::Good,
+        };
+        (quality, all.join(", "))
+    }
+
+    /// How often event time has begun anew.
+    pub(super) fn generation(&self) -> u64 {
+        self.history.restarts()
     }
 
     /// Whether what is shown is the present.
@@ -432,9 +418,14 @@ impl Bed {
         }
     }
 
+    /// How long ago the newest estimate arrived, or without one the newest sample; None if nothing has.
+    pub(super) fn silence(&self, now: Duration) -> Option<Duration> {
+        Some(now.saturating_sub(self.estimate_arrival.or(self.sample_arrival)?))
+    }
+
     /// Age of the data behind the newest estimate: how long ago it arrived, and how far it is behind the samples.
     pub(super) fn age(&self, now: Duration) -> Option<Duration> {
-        let since_arrival = now.saturating_sub(self.estimate_arrival.or(self.sample_arrival)?);
+        let since_arrival = self.silence(now)?;
         let (Some((estimate_ns, _)), Some(sample_ns)) = (&self.state, self.newest_sample_ns()) else {
             return Some(since_arrival);
         };
@@ -537,7 +528,9 @@ impl Parameter {
         let fields = ["mean", "q05", "q95", "since_informed_s", "identifiable"];
         let [mean, low, high, since_informed_s, identifiable] =
             fields.map(|name| statistic(&PARAMETER_STATISTICS, row, name));
-        self.trend.push(time_ns, Band::from_row(&PARAMETER_STATISTICS, row), TREND);
+        let is_informed = identifiable > 0.5 && since_informed_s <= UNINFORMED_AFTER_S;
+        let band = Band::from_row(&PARAMETER_STATISTICS, row);
+        self.trend.push(time_ns, TrendPoint { band, is_informed }, TREND);
         let (name, unit, trend) = (std::mem::take(&mut self.name), self.unit, std::mem::take(&mut self.trend));
         *self = Self { name, unit, mean, low, high, since_informed_s, is_identifiable: identifiable > 0.5, trend };
     }
@@ -553,6 +546,20 @@ fn tame_status(mut status: Status) -> Status {
         (*name, *state, *artefact) = (tame(name, MAX_NAME), tame(state, MAX_NAME), tame(artefact, MAX_NAME));
     }
     status
+}
+
+/// `[QUANTITIES]`, NaN where not published.
+fn spread(columns: &[Option<usize>], row: &[f64]) -> Vec<Spread> {
+    let unknown = Spread { total: f64::NAN, epistemic: f64::NAN, aleatoric: f64::NAN, model: f64::NAN };
+    let mut all = vec![unknown; QUANTITIES];
+    for (column, statistics) in columns.iter().zip(row.chunks(STATE_STATISTICS.len())) {
+        if let Some(q) = column {
+            let [total, epistemic, aleatoric, model] =
+                ["sd", "epistemic_sd", "aleatoric_sd", "model_sd"].map(|s| statistic(&STATE_STATISTICS, statistics, s));
+            all[*q] = Spread { total, epistemic, aleatoric, model };
+        }
+    }
+    all
 }
 
 /// Nanoseconds as seconds.
