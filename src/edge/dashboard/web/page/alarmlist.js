@@ -8,7 +8,7 @@ import { clockText, secondsOf } from "./time.js";
 const SHOWN_LIMIT = 50;
 
 export class AlarmList {
-  /** `onAcknowledge(name)` is called with the name of an alarm, `""` for all. */
+  /** `onAcknowledge(name)` is called with the name of an alarm, `""` for all, and says whether that went out. */
   constructor({ onAcknowledge }) {
     this.list = byId("alarm-list");
     this.all = byId("acknowledge-all");
@@ -52,7 +52,9 @@ export class AlarmList {
 
   #button(name) {
     const button = element("button", { type: "button", "data-alarm": name, "aria-label": `Acknowledge ${name}`, text: "Acknowledge" });
-    button.addEventListener("click", () => this.onAcknowledge(name));
+    button.addEventListener("click", () => {
+      if (!this.onAcknowledge(name)) button.textContent = "Not sent";
+    });
     return button;
   }
 }

@@ -27,7 +27,7 @@ function takeFrame(buffer) {
     if (head.kind === "ward" && view === "ward") ward.take(head);
     else if (head.kind === "bed" && view === "bed") bed.take(head, numbers);
     else return;
-    if (head.kind === "ward") showBus(head.connected);
+    showBus(head.connected);
     byId("misread").hidden = true;
   } catch (error) {
     setText(byId("misread"), `A frame of the server was not understood: ${error.message}`);

@@ -9,7 +9,7 @@ import { EventLog } from "./eventlog.js";
 import { fileName, save, stripsCsv, stripsPng } from "./export.js";
 import { writeHealth } from "./health.js";
 import { History } from "./history.js";
-import { isCurrent, livenessText } from "./liveness.js";
+import { isCurrent, livenessText, outageText, qualityText } from "./liveness.js";
 import { addLoops } from "./loops.js";
 import { markersOf } from "./markers.js";
 import { Numerics } from "./numerics.js";
@@ -133,10 +133,13 @@ export class Bed {
     const { history, viewport } = this;
     const { latest } = history;
     this.#writeHead();
-    this.timeline.write();
+    // The past stays what it was, whatever the bed is now.
     const current = this.head === null || viewport.isPaused || isCurrent(this.head.liveness);
+    this.timeline.write(current);
+    setAttribute(this.node, "data-current", String(current));
+    setText(byId("strips-stale"), current ? "" : outageText(this.head));
     this.numerics.write((key) => (current ? (history.beatAt(key, viewport.right) ?? liveOnly(viewport, latest.beat?.[key])) : null));
-    this.strips.write(history, viewport);
+    this.strips.write(history, viewport, current);
     this.trends.write(history, viewport);
     this.sources.write(latest.quantities ?? []);
     this.events.write(history.events);
@@ -150,7 +153,7 @@ export class Bed {
     setAttribute(this.node, "data-liveness", liveness);
     setText(byId("bed-liveness"), head ? livenessText(liveness, head.age_s) : "waiting");
     setAttribute(byId("bed-liveness"), "data-liveness", liveness);
-    setText(byId("bed-quality"), head ? `${head.quality ?? ""} ${head.quality_text ?? ""}`.trim() : "");
+    setText(byId("bed-quality"), head ? qualityText(head) : "");
     setAttribute(byId("bed-quality"), "data-quality", head?.quality ?? "");
     byId("bed-unknown").hidden = head?.known !== false;
     const raised = byUrgency(this.history.latest.alarms);

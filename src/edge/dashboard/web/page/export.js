@@ -41,7 +41,18 @@ export function stripsCsv(history, viewport, names) {
   for (const name of samples) collect(history.samples.get(name), [[`${name}_sample`, history.samples.get(name).column("value")]]);
   collect(truth, truths.map((name) => [`${name}_truth`, truth.column(name)]));
   rows.sort((one, other) => one.time - other.time);
-  return `${[header.join(","), ...rows.map((row) => line(row, header.length))].join("\n")}\n`;
+  return `${[header.join(","), ...joined(rows).map((row) => line(row, header.length))].join("\n")}\n`;
+}
+
+// Numbers of the same time share a row.
+function joined(rows) {
+  const all = [];
+  for (const row of rows) {
+    const last = all[all.length - 1];
+    if (last && row.time - last.time < SAME_TIME_S) last.cells.push(...row.cells);
+    else all.push(row);
+  }
+  return all;
 }
 
 function line({ time, cells }, width) {
@@ -51,6 +62,8 @@ function line({ time, cells }, width) {
   return texts.join(",");
 }
 
+/** Times that differ by less came apart in rounding. */
+const SAME_TIME_S = 2e-5;
 const HEAD_PX = 34;
 const NUMBERS_PX = 190;
 

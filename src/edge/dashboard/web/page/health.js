@@ -10,11 +10,13 @@ const MISFIT = 1.5;
 
 const ms = (value) => (value == null ? NONE : `${number(value, value < 10 ? 2 : 0)} ms`);
 
+const lagText = (status) => ["p50", "p99", "max"].map((part) => number(status[`lag_${part}_ms`], 1)).join(" · ");
+
 /** Shows a status of the protocol; nothing but dashes without one. */
 export function writeHealth(status) {
   setText(byId("health-members"), status ? `${count(status.members_alive)} of ${count(status.members)}` : NONE);
   byId("health-members").dataset.bad = String(Boolean(status) && status.members_alive < status.members);
-  setText(byId("health-lag"), status ? `${ms(status.lag_p50_ms)} · ${ms(status.lag_p99_ms)} · ${ms(status.lag_max_ms)}` : NONE);
+  setText(byId("health-lag"), status ? lagText(status) : NONE);
   setText(byId("health-solve"), ms(status?.solve_ms));
   setText(byId("health-queue"), count(status?.queue_depth));
   setText(byId("health-windows"), count(status?.windows));

@@ -5,7 +5,7 @@ import { Series } from "./series.js";
 import { secondsOf } from "./time.js";
 
 /** Seconds of the past that are kept. */
-export const KEPT_S = 600;
+const KEPT_S = 600;
 
 const ESTIMATE_LIMIT = 75_000;
 const TRUTH_LIMIT = 75_000;

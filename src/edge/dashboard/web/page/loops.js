@@ -6,11 +6,19 @@ import { color, veil } from "./theme.js";
 
 const POINTS_LIMIT = 160;
 const LEAST_POINTS = 8;
+/** A loop with a gap longer than this share of the beat is not drawn. */
+const GAP_SHARE = 0.15;
 const USUAL_BEAT_S = 0.85;
 const VENTRICLES = [
   { id: "loop-l", pressure: "p_l", volume: "v_l", hue: "hue-l" },
   { id: "loop-r", pressure: "p_r", volume: "v_r", hue: "hue-r" },
 ];
+
+const NOTHING = {
+  xaxis: { visible: false },
+  yaxis: { visible: false },
+  annotations: [{ text: "no whole beat here", showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.5 }],
+};
 
 /** Adds the loops to `charts`; `scene()` gives `{history, viewport}`. */
 export function addLoops(charts, scene) {
@@ -18,7 +26,8 @@ export function addLoops(charts, scene) {
     charts.add(byId(ventricle.id), () => {
       const { history, viewport } = scene();
       const beat = lastBeat(history, viewport.right, ventricle);
-      return beat && figureOf(beat, ventricle);
+      if (!beat) return null;
+      return beat.length ? figureOf(beat, ventricle) : { data: [], layout: NOTHING };
     });
   }
 }
@@ -39,7 +48,15 @@ function lastBeat(history, right, { pressure, volume }) {
       points.push({ p, v, dp: Math.max((pHigh - pLow) / 2, 0), dv: Math.max((vHigh - vLow) / 2, 0) });
     }
   }
-  return points.length >= LEAST_POINTS ? points : null;
+  const isWhole = points.length >= LEAST_POINTS && covers(estimate.times, from, to, right, length);
+  return isWhole ? points : [];
+}
+
+// A loop closed over a gap would be a picture of nothing that ever was.
+function covers(times, from, to, right, length) {
+  let longest = Math.max(times[from] - (right - length), right - times[to - 1]);
+  for (let i = from + 1; i < to; i += 1) longest = Math.max(longest, times[i] - times[i - 1]);
+  return longest < GAP_SHARE * length;
 }
 
 // What an ellipse of the half widths sweeps along the loop: for every point the places where it is farthest out and
@@ -66,9 +83,9 @@ function tube(points) {
 function figureOf(points, { volume, pressure, hue }) {
   const closed = [...points, points[0]];
   const common = { type: "scatter", mode: "lines" };
-  const band = { ...common, ...tube(points), fill: "toself", fillcolor: veil(hue, 0.28), line: { width: 0 }, hoverinfo: "skip" };
+  const band = { ...common, ...tube(points), fill: "toself", fillcolor: veil(hue, 0.28), line: { width: 0, simplify: false }, hoverinfo: "skip" };
   const mean = {
-    ...common, x: closed.map((q) => q.v), y: closed.map((q) => q.p), line: { color: color(hue), width: 2.5 },
+    ...common, x: closed.map((q) => q.v), y: closed.map((q) => q.p), line: { color: color(hue), width: 2.5, simplify: false },
     hovertemplate: "%{x:.0f} mL, %{y:.0f} mmHg<extra></extra>",
   };
   const now = points[points.length - 1];

@@ -18,7 +18,10 @@ export function markersOf(history) {
     const label = short(`${signOf(alarm.priority)} ${alarm.name}`);
     return { time: secondsOf(alarm.since_ns), kind: alarm.priority, label };
   });
-  return [...events, ...alarms.filter((alarm) => alarm.time !== null)];
+  const known = alarms.filter((alarm) => alarm.time !== null);
+  // An event that only tells of an alarm which is marked already would be a second mark in the same place.
+  const isSaid = (event) => event.label.startsWith("alarm") && known.some((alarm) => Math.abs(alarm.time - event.time) < 1);
+  return [...events.filter((event) => !isSaid(event)), ...known];
 }
 
 /** The marks between two times. */

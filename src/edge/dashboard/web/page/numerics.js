@@ -20,7 +20,7 @@ export class Numerics {
       const [label, main, side, unit, band] = ["label", "main", "side", "unit", "band"].map((part) =>
         element("span", { class: `cell-${part}` }),
       );
-      const node = element("div", { class: "cell" }, label, element("span", { class: "cell-value" }, main, side, unit), band);
+      const node = element("div", { class: "cell" }, label, unit, element("span", { class: "cell-value" }, main, side), band);
       byId("numerics").append(node);
       return { node, label, main, side, unit, band };
     });

@@ -14,14 +14,15 @@ export function paletteOf(hue) {
 function makePalette(hue) {
   return {
     ground: color("panel"),
+    plate: veil("panel", 0.8),
     grid: color("grid"),
     ink: color("ink"),
     quiet: color("quiet"),
     line: color(hue),
     band: veil(hue, 0.28),
     hatch: hatchOf(hue),
-    sample: veil("ink", 0.75),
-    truth: color("ink"),
+    sample: veil("ink", 0.55),
+    truth: veil("ink", 0.85),
     marker: { note: color("note"), high: color("alarm-high"), medium: color("alarm-medium"), low: color("alarm-low") },
   };
 }

@@ -6,19 +6,26 @@ import { NONE, number, range } from "./numbers.js";
 /** Systolic, diastolic and mean value with their bands of one pressure; `at` gives a clinical quantity by its key. */
 export function pressureReading(name, at) {
   const [systolic, diastolic, mean] = ["systolic", "diastolic", "mean"].map((part) => at(`${name}_${part}`));
-  const value = (band) => number(band?.mean, 0);
-  const band = (of) => range(of?.low, of?.high, 0);
   const isKnown = Boolean(systolic || diastolic || mean);
   return {
     label: describe(name).label,
     text: describe(name).text,
     color: describe(name).color,
     unit: "mmHg",
-    main: isKnown ? `${value(systolic)}/${value(diastolic)}` : NONE,
-    side: isKnown ? `(${value(mean)})` : "",
-    band: isKnown ? `${band(systolic)} / ${band(diastolic)} (${band(mean)})` : NONE,
+    ...arranged(name, isKnown, [systolic, diastolic, mean]),
     note: "",
   };
+}
+
+// Of a vein the mean is what is read, of an artery or a ventricle systole and diastole.
+function arranged(name, isKnown, bands) {
+  if (!isKnown) return { main: NONE, side: "", band: NONE };
+  const [systolic, diastolic, mean] = bands.map((of) => number(of?.mean, 0));
+  const [ofSystolic, ofDiastolic, ofMean] = bands.map((of) => range(of?.low, of?.high, 0));
+  if (name === "p_v" || name === "p_pv") {
+    return { main: mean, side: `(${systolic}/${diastolic})`, band: `${ofMean} (${ofSystolic} / ${ofDiastolic})` };
+  }
+  return { main: `${systolic}/${diastolic}`, side: `(${mean})`, band: `${ofSystolic} / ${ofDiastolic} (${ofMean})` };
 }
 
 /** A clinical quantity that is one number. */

@@ -2,7 +2,7 @@
 // a forecast as a whole.
 
 /** Longer without data than this, an estimate is a forecast [s]. */
-export const FORECAST_AFTER_S = 0.25;
+const FORECAST_AFTER_S = 0.25;
 
 /** Spacing that is never taken for a gap [s]. */
 const LEAST_GAP_S = 0.06;
@@ -16,21 +16,28 @@ export function longestSpacing(times, from, to) {
   return Math.max(3 * (spacings[spacings.length >> 1] ?? 0), LEAST_GAP_S);
 }
 
+/** Stretches `{from, to}` of rows `[from, to)` without a gap and without a missing value in `column`. */
+export function stretches(times, column, from, to) {
+  return split(times, column, from, to, () => false);
+}
+
 /** Runs `{from, to, isForecast}` of rows `[from, to)` of quantity `name`; where an estimate becomes a forecast both
  * share a row, so that the line does not break there. */
 export function runsOf(estimate, name, from, to) {
-  const { times } = estimate;
-  const mean = estimate.column(`${name}.mean`);
   const since = estimate.column("since_data");
+  return split(estimate.times, estimate.column(`${name}.mean`), from, to, (i) => since[i] > FORECAST_AFTER_S);
+}
+
+function split(times, column, from, to, isForecastAt) {
   const longest = longestSpacing(times, from, to);
   const runs = [];
   let run = null;
   for (let i = from; i < to; i += 1) {
-    if (Number.isNaN(mean[i])) {
+    if (Number.isNaN(column[i])) {
       run = null;
       continue;
     }
-    const isForecast = since[i] > FORECAST_AFTER_S;
+    const isForecast = isForecastAt(i);
     const isGap = run !== null && times[i] - times[i - 1] > longest;
     if (run === null || isGap || run.isForecast !== isForecast) {
       const shares = run !== null && !isGap;

@@ -8,7 +8,7 @@ const LEAST_USE = 0.5;
 /** A forecast's band may be far wider than the pressure moves; so much of the mean's span is shown of it on each side. */
 const BAND_SHARE = 0.6;
 const LEAST_SPAN = 4;
-const TICKS = 3;
+const TICKS = 4;
 
 /** Smallest and largest of the values to be shown of rows `[from, to)`; null if there is none. */
 export function extent(estimate, name, from, to) {

@@ -77,7 +77,7 @@ export class Strip {
   }
 
   /** Writes the value at the right edge; a few times a second, or nobody could read it. */
-  write(history, viewport, origin) {
+  write(history, viewport, origin, isCurrent) {
     const { estimate } = history;
     const mean = estimate.column(`${this.name}.mean`);
     const row = mean ? estimate.at(viewport.right) : -1;
@@ -87,7 +87,9 @@ export class Strip {
     const instant = `${number(at("mean"), digits)}  ${range(low, high, digits)} ${this.about.unit}`;
     setText(this.origin, Object.hasOwn(ORIGINS, origin) ? ORIGINS[origin] : "");
     setAttribute(this.origin, "data-origin", origin ?? "");
-    if (this.isPressure) {
+    if (!isCurrent) {
+      this.#writeNothing(row < 0 ? "" : `was ${instant}`);
+    } else if (this.isPressure) {
       const reading = pressureReading(this.name, (key) => history.beatAt(key, viewport.right));
       setText(this.main, reading.main);
       setText(this.side, reading.side);
@@ -99,5 +101,14 @@ export class Strip {
       setText(this.instant, row < 0 ? NONE : `${range(low, high, digits)} ${this.about.unit}`);
       setAttribute(this.canvas, "aria-label", `${this.about.text}: ${instant}`);
     }
+  }
+
+  // A number that is no longer true must not look like one.
+  #writeNothing(was) {
+    setText(this.main, NONE);
+    setText(this.side, "");
+    setText(this.band, "");
+    setText(this.instant, was);
+    setAttribute(this.canvas, "aria-label", `${this.about.text}: no current value`);
   }
 }

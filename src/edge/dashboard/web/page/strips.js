@@ -41,10 +41,10 @@ export class Strips {
     }
   }
 
-  /** Writes the numbers of every strip. */
-  write(history, viewport) {
+  /** Writes the numbers of every strip; of a bed that is not current there are none. */
+  write(history, viewport, isCurrent) {
     const origins = new Map((history.latest.quantities ?? []).map((q) => [q.name, q.origin]));
-    for (const strip of this.strips.values()) strip.write(history, viewport, origins.get(strip.name));
+    for (const strip of this.strips.values()) strip.write(history, viewport, origins.get(strip.name), isCurrent);
   }
 
   /** Forgets scales of another bed. */

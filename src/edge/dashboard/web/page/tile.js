@@ -2,8 +2,8 @@
 
 import { badge, byUrgency, highestPriority } from "./alarms.js";
 import { element, setAttribute, setText } from "./dom.js";
-import { isCurrent, livenessText } from "./liveness.js";
-import { duration, NONE } from "./numbers.js";
+import { isCurrent, livenessText, outageText, qualityText } from "./liveness.js";
+import { NONE } from "./numbers.js";
 import { pressureReading, singleReading } from "./readings.js";
 
 const CELLS = [
@@ -26,13 +26,13 @@ export class Tile {
     this.quality = element("span", { class: "quality" });
     this.health = element("span", { class: "tile-health" });
     this.cells = CELLS.map(({ size }) => new Cell(size));
+    const label = element("strong", { class: "tile-name", text: name, title: name });
     this.link = element(
       "a",
       { class: "tile", href: `#bed/${encodeURIComponent(name)}`, "data-testid": `tile-${name}`, tabindex: "-1" },
-      element("div", { class: "tile-head" }, element("strong", { class: "tile-name", text: name, title: name }), this.liveness),
+      element("div", { class: "tile-head" }, label, this.quality, this.health, this.liveness),
       this.alarms,
       element("div", { class: "tile-cells" }, ...this.cells.map((cell) => cell.node)),
-      element("div", { class: "tile-foot" }, this.quality, this.health),
       this.stale,
     );
     this.node = element("li", {}, this.link);
@@ -47,19 +47,14 @@ export class Tile {
     setAttribute(this.link, "data-alarm", highestPriority(bed.alarms));
     setAttribute(this.link, "data-quality", bed.quality);
     setText(this.liveness, livenessText(bed.liveness, bed.age_s));
-    this.#updateStale(bed, current);
+    setText(this.stale, current ? "" : outageText(bed));
     this.#updateAlarms(bed.alarms ?? []);
     const at = (key) => bed.values?.[key] ?? null;
     CELLS.forEach(({ of }, k) => this.cells[k].update(of(at), current));
-    setText(this.quality, `${qualitySign(bed.quality)} ${bed.quality_text || bed.quality}`);
+    setText(this.quality, qualityText(bed));
+    setAttribute(this.quality, "title", qualityText(bed));
     setText(this.health, healthText(bed));
     setAttribute(this.link, "aria-label", `${bed.bed}, ${livenessText(bed.liveness, bed.age_s)}, ${alarmWords(bed.alarms)}`);
-  }
-
-  #updateStale(bed, current) {
-    const ago = bed.age_s == null ? "" : `for ${duration(Math.max(bed.age_s, 0))}`;
-    const words = { stale: `NO NEW DATA ${ago}`, no_estimate: "NO ESTIMATE YET", not_heard: "NOTHING HEARD" };
-    setText(this.stale, current ? "" : (words[bed.liveness] ?? "NOT LIVE").trim());
   }
 
   #updateAlarms(alarms) {
@@ -100,13 +95,9 @@ class Cell {
   }
 }
 
-const QUALITY_SIGNS = { good: "✓", degraded: "△", bad: "✕" };
-
-const qualitySign = (quality) => (Object.hasOwn(QUALITY_SIGNS, quality) ? QUALITY_SIGNS[quality] : "?");
-
 function healthText(bed) {
   const lag = bed.lag_ms == null ? "" : `lag ${bed.lag_ms.toFixed(bed.lag_ms < 10 ? 1 : 0)} ms`;
-  const members = bed.members != null && bed.members_alive < bed.members ? `${bed.members_alive}/${bed.members} members` : "";
+  const members = bed.members != null && bed.members_alive < bed.members ? `${bed.members_alive}/${bed.members}` : "";
   return [members, lag].filter(Boolean).join(" · ");
 }
 

@@ -2,6 +2,7 @@
 
 import { byId, element, setAttribute, setText } from "./dom.js";
 import { duration } from "./numbers.js";
+import { secondsPerLine } from "./paint.js";
 import { clockText } from "./time.js";
 import { SPANS_S } from "./viewport.js";
 
@@ -23,7 +24,7 @@ export class Timeline {
   }
 
   /** Shows where in time the picture is. */
-  write() {
+  write(isCurrent) {
     const { viewport } = this;
     const behind = viewport.newest - viewport.right;
     SPANS_S.forEach((span, k) => setAttribute(this.spans[k], "aria-pressed", String(span === viewport.span)));
@@ -33,8 +34,11 @@ export class Timeline {
     this.slider.min = String(Math.min(Math.floor(viewport.oldest + viewport.span - viewport.newest), -1));
     this.slider.value = String(-behind);
     setAttribute(this.slider, "aria-valuetext", viewport.isPaused ? `${duration(behind)} behind` : "live");
+    setText(byId("grid-step"), `grid ${secondsPerLine(viewport.span)} s`);
     setText(byId("when"), clockText(viewport.right));
-    setText(byId("behind"), viewport.isPaused ? `PAUSED, ${duration(behind)} behind` : "live");
-    setAttribute(byId("behind"), "data-paused", String(viewport.isPaused));
+    const state = viewport.isPaused ? "paused" : isCurrent ? "live" : "outage";
+    const words = { paused: `PAUSED, ${duration(behind)} behind`, live: "live", outage: "newest there is" };
+    setText(byId("behind"), words[state]);
+    setAttribute(byId("behind"), "data-state", state);
   }
 }

@@ -11,6 +11,8 @@ const BEAT_TRENDS = ["cardiac_output", "heart_rate", "svr", "pvr", "p_a_mean", "
 const CHARTS_LIMIT = 40;
 /** The shortest axis of a trend [s]. */
 const LEAST_SPAN_S = 60;
+/** The longest: all that is kept. */
+const LONGEST_SPAN_S = 600;
 /** Rows drawn of one trend; more than a small chart has pixels. */
 const POINTS_LIMIT = 600;
 
@@ -70,8 +72,8 @@ class TrendCard {
     this.state = element("span", { class: "trend-state" });
     this.plot = element("div", { class: "trend-plot", role: "img", "aria-label": `trend of ${about.text}` });
     const label = element("span", { class: "trend-label", text: about.label, title: about.text });
-    const head = element("div", { class: "trend-head", style: `--hue: var(--${this.hue})` }, label, this.value, this.band, this.state);
-    this.node = element("div", { class: "trend" }, head, this.plot);
+    const head = element("div", { class: "trend-head", style: `--hue: var(--${this.hue})` }, label, this.value, this.state);
+    this.node = element("div", { class: "trend" }, head, this.band, this.plot);
   }
 
   seriesOf(history) {
@@ -105,11 +107,12 @@ function informedText(history, name, informed) {
 
 function figureOf(series, viewport, markers, hue) {
   const { right } = viewport;
-  const left = Math.min(Math.max(series.oldest, right - 600), right - LEAST_SPAN_S);
+  const left = Math.min(Math.max(series.oldest, right - LONGEST_SPAN_S), right - LEAST_SPAN_S);
   const rows = pick(series, left, right);
   const data = [];
   for (const informed of [true, false]) {
-    const shown = rows.map(([i, isInformed]) => (isInformed === informed ? i : -1));
+    // The row before a stretch belongs to it too, so that stretches meet.
+    const shown = rows.map(([i, isInformed], k) => (isInformed === informed || rows[k + 1]?.[1] === informed ? i : -1));
     if (shown.some((i) => i >= 0)) data.push(...bandTraces(series, shown, right, informed ? hue : "quiet", informed));
   }
   const truth = series.column("truth");
@@ -131,7 +134,7 @@ function pick(series, left, right) {
   return rows;
 }
 
-// Rows of -1 are breaks; the row before a break is taken along, so that neighbouring stretches meet.
+// Rows of -1 are breaks.
 function points(series, rows, right, column) {
   return {
     type: "scatter", mode: "lines", connectgaps: false,
@@ -169,11 +172,11 @@ function stretches(rows) {
 }
 
 function timeAxis(left) {
-  const step = left < -300 ? 120 : left < -120 ? 60 : 30;
+  const step = left < -300 ? 120 : left < -90 ? 60 : 30;
   const ticks = [];
   for (let tick = 0; tick >= left; tick -= step) ticks.push(tick);
   const text = (tick) => (tick === 0 ? "0" : step < 60 ? `${tick} s` : `${tick / 60} min`).replace("-", "−");
-  return axis({ range: [left, 0], tickvals: ticks, ticktext: ticks.map(text) });
+  return axis({ range: [left, 0], tickvals: ticks, ticktext: ticks.map(text), tickangle: 0 });
 }
 
 function shapesOf(markers, right) {
