@@ -1,0 +1,68 @@
+// The alarms of a bed: raised ones first, each with a button to say that it was seen; quiet ones with their limits.
+
+import { byUrgency, isRaised, signOf } from "./alarms.js";
+import { byId, element, setAttribute, setText } from "./dom.js";
+import { decimals, number, range } from "./numbers.js";
+import { clockText, secondsOf } from "./time.js";
+
+const SHOWN_LIMIT = 50;
+
+export class AlarmList {
+  /** `onAcknowledge(name)` is called with the name of an alarm, `""` for all, and says whether that went out. */
+  constructor({ onAcknowledge }) {
+    this.list = byId("alarm-list");
+    this.all = byId("acknowledge-all");
+    this.onAcknowledge = onAcknowledge;
+    this.shown = null;
+    this.all.addEventListener("click", () => onAcknowledge(""));
+  }
+
+  /** Shows the alarms; a list that did not change is left alone, so that no button moves away under the pointer. */
+  write(alarms) {
+    const raised = byUrgency(alarms);
+    const others = alarms.filter((alarm) => !isRaised(alarm));
+    const key = JSON.stringify(alarms);
+    if (key === this.shown) return;
+    this.shown = key;
+    const focused = this.list.contains(document.activeElement) ? document.activeElement.dataset.alarm : null;
+    this.list.replaceChildren(...[...raised, ...others].slice(0, SHOWN_LIMIT).map((alarm) => this.#item(alarm)));
+    if (focused !== null) [...this.list.querySelectorAll("button")].find((b) => b.dataset.alarm === focused)?.focus();
+    this.all.hidden = !raised.some((alarm) => !alarm.acknowledged);
+    byId("no-alarms").hidden = alarms.length > 0;
+    this.#announce(raised);
+  }
+
+  #announce(raised) {
+    const text = raised.filter((a) => !a.acknowledged).map((a) => `${a.priority} alarm: ${a.name}`).join(", ");
+    setText(byId("alarm-voice"), text);
+  }
+
+  #item(alarm) {
+    const item = element("li", { "data-priority": alarm.priority, "data-state": alarm.state });
+    setAttribute(item, "data-acknowledged", String(Boolean(alarm.acknowledged)));
+    const state = alarm.acknowledged ? "active, seen" : alarm.state === "latched" ? "was on" : alarm.state;
+    item.append(
+      element("span", { class: "alarm-sign", text: isRaised(alarm) ? signOf(alarm.priority) : "○", title: `${alarm.priority} priority` }),
+      element("span", { class: "alarm-what" }, element("b", { text: alarm.name }), " ", element("span", { class: "alarm-state", text: state })),
+      element("span", { class: "alarm-text", text: detail(alarm) }),
+    );
+    if (isRaised(alarm) && !alarm.acknowledged) item.append(this.#button(alarm.name));
+    return item;
+  }
+
+  #button(name) {
+    const button = element("button", { type: "button", "data-alarm": name, "aria-label": `Acknowledge ${name}`, text: "Acknowledge" });
+    button.addEventListener("click", () => {
+      if (!this.onAcknowledge(name)) button.textContent = "Not sent";
+    });
+    return button;
+  }
+}
+
+function detail(alarm) {
+  const digits = decimals(alarm.mean, (alarm.high - alarm.low) / 2);
+  const limit = `${alarm.quantity} ${alarm.side === "below" ? "<" : ">"} ${alarm.limit} ${alarm.unit}`;
+  const band = alarm.mean == null ? "" : `, is ${number(alarm.mean, digits)} (${range(alarm.low, alarm.high, digits)})`;
+  const since = isRaised(alarm) ? `, since ${clockText(secondsOf(alarm.since_ns))}` : "";
+  return `${limit}${band}${since}`;
+}

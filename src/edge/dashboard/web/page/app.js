@@ -1,0 +1,151 @@
+// The page: which view is shown, what the server is asked for, when something is drawn.
+
+import { Bed } from "./bed.js";
+import { startCommands } from "./commands.js";
+import { Connection } from "./connection.js";
+import { byId, setAttribute, setText } from "./dom.js";
+import { save } from "./export.js";
+import { decodeFrame } from "./frame.js";
+import { Meter } from "./meter.js";
+import { duration } from "./numbers.js";
+import { onTheme, startTheme } from "./theme.js";
+import { SPANS_S } from "./viewport.js";
+import { Ward } from "./ward.js";
+
+const meter = new Meter();
+let view = "ward";
+let isDue = false;
+
+startTheme(byId("theme"));
+const ward = new Ward();
+const connection = new Connection({ onFrame: takeFrame, onState: showConnection });
+const bed = new Bed({ show: (wish) => connection.show(wish), send: (order) => connection.send(order), changed: requestDraw });
+
+function takeFrame(buffer) {
+  try {
+    const { head, numbers } = decodeFrame(buffer);
+    if (head.kind === "ward" && view === "ward") ward.take(head);
+    else if (head.kind === "bed" && view === "bed") bed.take(head, numbers);
+    else return;
+    showBus(head.connected);
+    byId("misread").hidden = true;
+  } catch (error) {
+    setText(byId("misread"), `A frame of the server was not understood: ${error.message}`);
+    byId("misread").hidden = false;
+  }
+  requestDraw();
+}
+
+// One picture at most is due, of whatever is newest by then: a slow browser skips pictures instead of falling behind.
+function requestDraw() {
+  if (isDue) return;
+  isDue = true;
+  requestAnimationFrame((now) => {
+    isDue = false;
+    if (view === "ward") ward.draw();
+    else bed.draw(now);
+    meter.tick(now);
+  });
+}
+
+function showConnection(state) {
+  setAttribute(byId("connection"), "data-state", state);
+  setText(byId("connection"), state === "open" ? "● connected" : "✕ lost");
+  document.body.dataset.connection = state;
+  byId("lost").hidden = state === "open";
+}
+
+function showBus(isConnected) {
+  byId("bus").hidden = isConnected !== false;
+}
+
+setInterval(() => {
+  if (connection.state !== "lost") return;
+  setText(byId("lost-age"), `What you see is ${duration(connection.silentFor())} old. Trying again by itself.`);
+}, 500);
+
+function route() {
+  const before = bed.name;
+  const name = location.hash.startsWith("#bed/") ? decode(location.hash.slice("#bed/".length)) : "";
+  view = name ? "bed" : "ward";
+  byId("ward-view").hidden = view !== "ward";
+  byId("bed-view").hidden = view !== "bed";
+  byId("back").hidden = view !== "bed";
+  byId("export-png").disabled = view !== "bed";
+  document.body.dataset.view = view;
+  if (name) {
+    scrollTo(0, 0);
+    bed.open(name);
+    return;
+  }
+  if (before) bed.close();
+  connection.show({ show: "ward" });
+  requestDraw();
+  if (before) requestAnimationFrame(() => ward.focus(before));
+}
+
+function decode(text) {
+  try {
+    return decodeURIComponent(text);
+  } catch {
+    return text;
+  }
+}
+
+function exportCsv() {
+  if (view === "bed") bed.export("csv");
+  else save(new Blob([ward.csv()], { type: "text/csv" }), "ward.csv");
+}
+
+function showKeys() {
+  byId("keys").showModal();
+}
+
+const inBed = { views: ["bed"], where: "bed" };
+startCommands(
+  [
+    { names: ["↑ ↓ ← →"], keys: ["ArrowDown", "ArrowRight"], text: "move between beds", views: ["ward"], where: "ward", run: () => ward.focus(null) },
+    { names: ["Enter"], keys: [], text: "open the bed", views: ["ward"], where: "ward" },
+    { names: ["/"], keys: ["/"], text: "find a bed by name", views: ["ward"], where: "ward", run: () => byId("filter").focus() },
+    { names: ["Esc"], keys: ["Escape"], text: "back to the ward", ...inBed, run: () => (location.hash = "#ward") },
+    { names: ["Space"], keys: [" "], text: "pause, go on", ...inBed, run: () => bed.viewport.toggle() },
+    { names: ["←", "→"], keys: ["ArrowLeft", "ArrowRight"], text: "back and forth in time", ...inBed, run: (key) => bed.viewport.step(key === "ArrowLeft" ? -0.25 : 0.25) },
+    { names: ["l", "End"], keys: ["l", "End"], text: "back to live", ...inBed, run: () => bed.viewport.live() },
+    { names: ["1 … 5"], keys: ["1", "2", "3", "4", "5"], text: `show ${SPANS_S.join(", ")} s`, ...inBed, run: (key) => bed.viewport.setSpan(SPANS_S[Number(key) - 1]) },
+    { names: ["n"], keys: ["n"], text: "write a note", ...inBed, run: () => byId("note-text").focus() },
+    { names: ["t"], keys: ["t"], text: "light, dark, as the system", where: "everywhere", run: () => byId("theme").click() },
+    { names: ["?"], keys: ["?"], text: "these keys", where: "everywhere", run: showKeys },
+  ],
+  () => view,
+);
+
+byId("export-csv").addEventListener("click", exportCsv);
+byId("export-png").addEventListener("click", () => bed.export("png"));
+byId("help").addEventListener("click", showKeys);
+onTheme(requestDraw);
+addEventListener("hashchange", route);
+showConnection("lost");
+route();
+
+/** What tests may look at. */
+const account = Object.freeze({
+  get fps() {
+    return meter.fps();
+  },
+  get frames() {
+    return meter.frames;
+  },
+  get view() {
+    return view;
+  },
+  get bed() {
+    return bed.name;
+  },
+  get newest_ns() {
+    return bed.newestNs;
+  },
+  get drawn() {
+    return view === "bed" ? bed.drawn() : {};
+  },
+});
+Object.defineProperty(window, "hemostream", { value: account, enumerable: true });

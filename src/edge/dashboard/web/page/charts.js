@@ -1,0 +1,90 @@
+// Charts by plotly: fetched when the first one is needed, then drawn in turns, one at a time, so that no redraw holds up
+// the strips. Charts that nobody sees are not drawn.
+
+import { color, onTheme } from "./theme.js";
+
+/** Between two charts; with about six charts in sight each is a second old at most. */
+const TURN_MS = 160;
+/** A chart is not drawn more often than this. */
+const LEAST_AGE_MS = 900;
+
+let plotly = null;
+
+function load() {
+  plotly ??= new Promise((resolve, reject) => {
+    const script = document.createElement("script");
+    script.src = "/plotly.js";
+    script.onload = () => resolve(window.Plotly);
+    script.onerror = () => reject(new Error("/plotly.js cannot be loaded"));
+    document.head.append(script);
+  });
+  return plotly;
+}
+
+export class Charts {
+  constructor() {
+    this.charts = new Set();
+    this.isOn = false;
+    this.observer = new IntersectionObserver((entries) => {
+      for (const { target, isIntersecting } of entries) target.isInSight = isIntersecting;
+    });
+    onTheme(() => {
+      for (const chart of this.charts) chart.drawnAt = -Infinity;
+    });
+    setInterval(() => this.#turn(), TURN_MS);
+  }
+
+  /** Adds a chart: `figure()` gives `{data, layout}` to be drawn in `node`, or null while there is nothing. */
+  add(node, figure) {
+    const chart = { node, figure, drawnAt: -Infinity };
+    this.charts.add(chart);
+    this.observer.observe(node);
+    return chart;
+  }
+
+  /** Takes a chart away. */
+  remove(chart) {
+    this.charts.delete(chart);
+    this.observer.unobserve(chart.node);
+    if (chart.isDrawn) window.Plotly.purge(chart.node);
+  }
+
+  /** Whether turns are taken: not while the view is hidden or nothing new can be shown. */
+  run(isOn) {
+    this.isOn = isOn;
+  }
+
+  #turn() {
+    if (!this.isOn || document.hidden) return;
+    const now = performance.now();
+    const due = [...this.charts].filter((chart) => chart.node.isInSight && now - chart.drawnAt > LEAST_AGE_MS);
+    if (!due.length) return;
+    const chart = due.reduce((one, other) => (other.drawnAt < one.drawnAt ? other : one));
+    chart.drawnAt = now;
+    load().then((Plotly) => draw(Plotly, chart), (error) => (chart.node.textContent = error.message));
+  }
+}
+
+function draw(Plotly, chart) {
+  const figure = chart.figure();
+  if (!figure) return;
+  chart.isDrawn = true;
+  Plotly.react(chart.node, figure.data, { ...baseLayout(), ...figure.layout }, { displayModeBar: false, responsive: true });
+}
+
+function baseLayout() {
+  return {
+    paper_bgcolor: "rgba(0,0,0,0)",
+    plot_bgcolor: "rgba(0,0,0,0)",
+    font: { family: "system-ui, sans-serif", size: 11, color: color("quiet") },
+    margin: { l: 40, r: 6, t: 6, b: 30 },
+    showlegend: false,
+    hovermode: "closest",
+    dragmode: false,
+  };
+}
+
+/** An axis in the colours of the page. */
+export function axis(more) {
+  return { gridcolor: color("grid"), zeroline: false, linecolor: color("line"), fixedrange: true, ...more };
+}

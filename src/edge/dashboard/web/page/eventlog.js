@@ -1,0 +1,56 @@
+// The event log, newest first, and the field for a note.
+
+import { byId, element, recall, remember, setText } from "./dom.js";
+import { clockText } from "./time.js";
+
+const SHOWN_LIMIT = 200;
+
+const GOOD = new Set(["start", "recovered", "artefact_over", "model_fits", "beat_found"]);
+
+const kindOf = (event) => (event.kind === "note" ? "note" : GOOD.has(event.kind) ? "good" : "other");
+
+export class EventLog {
+  /** `onNote(text, author)` sends a note and says whether it went out. */
+  constructor({ onNote }) {
+    this.list = byId("event-log");
+    this.text = byId("note-text");
+    this.author = byId("note-author");
+    this.answer = byId("note-answer");
+    this.author.value = recall("author", "");
+    this.shown = null;
+    byId("note").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.#send(onNote);
+    });
+  }
+
+  /** Shows the events; nothing is touched while there is no new one, so that text can be selected. */
+  write(events) {
+    const newest = events[events.length - 1];
+    const key = newest ? `${events.length} ${newest.time_ns} ${newest.text}` : "";
+    if (key === this.shown) return;
+    this.shown = key;
+    const sorted = [...events].sort((one, other) => (other.time ?? 0) - (one.time ?? 0)).slice(0, SHOWN_LIMIT);
+    this.list.replaceChildren(...sorted.map(itemOf));
+  }
+
+  #send(onNote) {
+    const text = this.text.value.trim();
+    if (!text) return;
+    remember("author", this.author.value.trim());
+    const isSent = onNote(text, this.author.value.trim());
+    setText(this.answer, isSent ? "" : "Not sent: the connection is lost.");
+    if (isSent) this.text.value = "";
+  }
+}
+
+function itemOf(event) {
+  const what = event.kind === "note" ? "✎ note" : `${event.kind} ${event.channel ?? ""}`.trim();
+  return element(
+    "li",
+    { "data-kind": kindOf(event) },
+    element("time", { text: clockText(event.time) }),
+    element("span", { class: "event-kind", text: what }),
+    element("span", { class: "event-text", text: event.text }),
+  );
+}
