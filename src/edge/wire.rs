@@ -188,7 +188,7 @@ pub struct Status {
     pub windows: u64,
     /// Of these, without a sample: forecasts.
     pub windows_without_data: u64,
-    /// From the arrival of the input that closed a window to its estimate, since the start \[ms\]: median.
+    /// From the arrival of the input that closed a window to its estimate, over the last minute or so \[ms\]: median.
     pub lag_p50_ms: f64,
     /// The same: 99th percentile.
     pub lag_p99_ms: f64,

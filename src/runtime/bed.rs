@@ -19,6 +19,9 @@ const MAX_LAG_US: u64 = 600_000_000;
 /// Weight of the newest job in the running mean of the solve time.
 const SOLVE_WEIGHT: f64 = 0.1;
 
+/// Lags are told of the last one to two of these \[ns\].
+const LATELY_NS: i64 = 30_000_000_000;
+
 /// What a bed is asked to do.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Task {
@@ -67,7 +70,8 @@ pub struct Health {
     pub windows: u64,
     /// Of these, without a sample.
     pub windows_without_data: u64,
-    /// Median lag from the closing of a window to its estimates being handed over for publishing \[ms\], over windows since the start.
+    /// Median lag from the closing of a window to its estimates being handed over for publishing \[ms\], over the
+    /// windows of the last minute or so.
     pub lag_p50_ms: f64,
     /// 99th percentile.
     pub lag_p99_ms: f64,
@@ -106,6 +110,37 @@ pub struct Account {
     pub lag_us: Option<Histogram<u64>>,
 }
 
+/// Lags of the present stretch of time and of the one before: an alert on them ends when the trouble does.
+struct Lately {
+    /// The present one first \[us\]; coarser than those since the start, because there are two per bed.
+    stretches: Option<[Histogram<u32>; 2]>,
+    began: ArrivalTime,
+}
+
+impl Lately {
+    fn new() -> Self {
+        let histogram = || Histogram::new_with_max(MAX_LAG_US, 2).ok();
+        Self { stretches: histogram().zip(histogram()).map(<[_; 2]>::from), began: ArrivalTime(0) }
+    }
+
+    fn record(&mut self, lag_us: u64, now: ArrivalTime) {
+        let Some(stretches) = &mut self.stretches else { return };
+        if now.ns_since(self.began) > LATELY_NS {
+            stretches.swap(0, 1);
+            stretches[0].reset();
+            self.began = now;
+        }
+        stretches[0].saturating_record(lag_us);
+    }
+
+    fn all(&self) -> Option<Histogram<u32>> {
+        let [present, before] = self.stretches.as_ref()?;
+        let mut all = present.clone();
+        all.add(before).ok()?;
+        Some(all)
+    }
+}
+
 /// A bed.
 pub struct Bed {
     /// Its name.
@@ -119,7 +154,9 @@ pub struct Bed {
     not_converged: u64,
     one_by_one: u64,
     solve_ms: f64,
+    /// Since the start.
     lag_us: Option<Histogram<u64>>,
+    lately: Lately,
     /// When the windows were closed of which nothing is said yet.
     closed: Vec<ArrivalTime>,
     counters: BTreeMap<&'static str, u64>,
@@ -147,6 +184,7 @@ impl Bed {
             one_by_one: 0,
             solve_ms: 0.0,
             lag_us: Histogram::new_with_max(MAX_LAG_US, 3).ok(),
+            lately: Lately::new(),
             closed: Vec::new(),
             counters: BTreeMap::new(),
             reported: BTreeMap::new(),
@@ -206,6 +244,7 @@ impl Bed {
             if let Some(histogram) = &mut self.lag_us {
                 histogram.saturating_record(lag_us);
             }
+            self.lately.record(lag_us, now);
         }
     }
 
@@ -283,7 +322,8 @@ impl Bed {
 
     #[allow(clippy::cast_precision_loss)]
     fn health(&self, queue_depth: usize, lost: &[(&'static str, u64)]) -> Health {
-        let lag = |quantile: f64| self.lag_us.as_ref().map_or(f64::NAN, |h| h.value_at_quantile(quantile) as f64 / 1e3);
+        let lately = self.lately.all();
+        let lag = |quantile: f64| lately.as_ref().map_or(f64::NAN, |h| h.value_at_quantile(quantile) as f64 / 1e3);
         let members = self.estimator.settings().members;
         let mut counters = self.counters.clone();
         counters.extend(self.estimator.refused().iter().map(|(cause, n)| (cause.name(), *n)));

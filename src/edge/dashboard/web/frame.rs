@@ -16,6 +16,11 @@ impl Parts {
         self.numbers.extend(numbers);
     }
 
+    /// Whether there is none.
+    pub(super) fn is_empty(&self) -> bool {
+        self.heads.is_empty()
+    }
+
     /// The bytes of a frame; the parts go into the head.
     pub(super) fn into_frame(self, mut head: Value) -> Vec<u8> {
         if let Value::Object(fields) = &mut head {

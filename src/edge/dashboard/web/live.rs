@@ -15,8 +15,8 @@ use crate::edge::wire::{self, Acknowledge, Note, SCHEMA};
 
 /// Time between two frames of a bed.
 const FRAME: Duration = Duration::from_millis(33);
-/// Frames of a bed between two that hold the rest too, and between two of the ward: half a second.
-const FRAMES_PER_REST: u64 = 15;
+/// So many times that between two frames of a bed that hold the rest too, and between two of the ward: half a second.
+const TICKS_PER_REST: u64 = 15;
 /// A page that takes nothing for so long is let go; it connects again by itself.
 const PATIENCE: Duration = Duration::from_secs(30);
 /// Closest points of a waveform, and the furthest apart \[ms\].
@@ -51,18 +51,18 @@ pub(super) async fn serve(mut socket: WebSocket, hub: Arc<Hub>) {
     hub.pages.fetch_add(1, Ordering::Relaxed);
     let mut shown = Shown::Ward { reset: true };
     let mut pace = paced();
-    let mut frames = 0_u64;
+    let mut ticks = 0_u64;
     loop {
         tokio::select! {
             received = socket.recv() => match received {
-                Some(Ok(Frame::Text(text))) => obey(&text, &hub, &mut shown, &mut frames).await,
+                Some(Ok(Frame::Text(text))) => obey(&text, &hub, &mut shown, &mut ticks).await,
                 Some(Ok(Frame::Close(_)) | Err(_)) | None => break,
                 Some(Ok(_)) => {}
             },
             _ = pace.tick() => {
-                let Some(bytes) = compose(&hub, &mut shown, frames) else { continue };
-                frames += 1;
-                if !bytes.is_empty() && !sent(&mut socket, bytes).await {
+                let frame = compose(&hub, &mut shown, ticks.is_multiple_of(TICKS_PER_REST));
+                ticks += 1;
+                if let Some(bytes) = frame && !sent(&mut socket, bytes).await {
                     break;
                 }
             }
@@ -82,23 +82,24 @@ async fn sent(socket: &mut WebSocket, bytes: Vec<u8>) -> bool {
     matches!(timeout(PATIENCE, socket.send(Frame::Binary(bytes.into()))).await, Ok(Ok(())))
 }
 
-/// The next frame; empty where this tick has none, None where nothing is shown.
-fn compose(hub: &Hub, shown: &mut Shown, frames: u64) -> Option<Vec<u8>> {
-    let with_rest = frames.is_multiple_of(FRAMES_PER_REST);
+/// The next frame, if there is something to tell.
+fn compose(hub: &Hub, shown: &mut Shown, with_rest: bool) -> Option<Vec<u8>> {
     let now = hub.now();
+    let reach = || Reach { connected: hub.is_connected(), dropped: hub.dropped() };
     match shown {
-        Shown::Nothing => None,
-        Shown::Ward { .. } if !with_rest => Some(Vec::new()),
-        Shown::Ward { reset } => {
-            let reach = Reach { connected: hub.is_connected(), dropped: hub.dropped() };
-            let first = std::mem::take(reset);
+        Shown::Ward { reset } if with_rest => {
+            let (reach, first) = (reach(), std::mem::take(reset));
             Some(hub.with_ward(|ward| ward_frame(ward, now, first, reach)))
         }
-        Shown::Bed(picture) => Some(hub.with_ward(|ward| picture.next(ward, now, with_rest))),
+        Shown::Nothing | Shown::Ward { .. } => None,
+        Shown::Bed(picture) => {
+            let reach = reach();
+            hub.with_ward(|ward| picture.next(ward, now, with_rest, reach))
+        }
     }
 }
 
-async fn obey(text: &str, hub: &Arc<Hub>, shown: &mut Shown, frames: &mut u64) {
+async fn obey(text: &str, hub: &Arc<Hub>, shown: &mut Shown, ticks: &mut u64) {
     let request: Request = match serde_json::from_str(text) {
         Ok(request) => request,
         Err(error) => {
@@ -108,7 +109,7 @@ async fn obey(text: &str, hub: &Arc<Hub>, shown: &mut Shown, frames: &mut u64) {
     };
     if let Some(what) = &request.show {
         // The first frame holds everything.
-        *frames = 0;
+        *ticks = 0;
         *shown = match what.as_str() {
             "ward" => Shown::Ward { reset: true },
             "bed" => {

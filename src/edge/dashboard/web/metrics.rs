@@ -117,7 +117,7 @@ fn of_process(scrape: &mut Scrape<'_>, own: Own) {
 }
 
 fn of_daemon(scrape: &mut Scrape<'_>, now: Duration) {
-    const LAG: &str = "From the closing of a window to its estimate being handed over, since the bed began";
+    const LAG: &str = "From the closing of a window to its estimate being handed over, in the last minute or so";
     scrape.gauges("bed_window_lag", LAG, Some(Unit::Seconds), |bed| {
         let quantiles = |s: &Status| [("0.5", s.lag_p50_ms), ("0.99", s.lag_p99_ms), ("1", s.lag_max_ms)];
         let all = bed.status.iter().flat_map(quantiles);

@@ -33,7 +33,7 @@ use axum::routing::get;
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 
-use self::assets::{ASSETS, JAVASCRIPT, plotly_js};
+use self::assets::{DOCUMENT, JAVASCRIPT, MODULES, plotly_js};
 pub use self::hub::Connect;
 use self::hub::Hub;
 use self::metrics::Own;
@@ -98,7 +98,7 @@ fn page_routes() -> Router<Arc<Hub>> {
         .route("/plotly.js", get(|| async { file(JAVASCRIPT, plotly_js(), "max-age=86400") }))
         .route("/live", get(live))
         .route("/api/beds", get(beds));
-    for asset in ASSETS {
+    for asset in DOCUMENT.iter().chain(MODULES) {
         router = router.route(asset.path, get(move || async { file(asset.content_type, asset.text, "no-cache") }));
     }
     router

@@ -15,7 +15,7 @@ use super::describe;
 use super::frame::{Parts, frame, seconds_after, time};
 use crate::model::cvsim6::Pressures;
 
-/// What is lost on the way, for the ward's head.
+/// How well the dashboard is in touch with the daemon.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Reach {
     /// Whether there is a link to the daemon.
@@ -69,11 +69,10 @@ impl BedPicture {
         Self { bed, quantities, spacing_ns, generation: None, sent: BTreeMap::new(), events: 0 }
     }
 
-    /// What is new; `with_rest` adds what a person reads rather than sees move.
-    pub(super) fn next(&mut self, ward: &Ward, now: Duration, with_rest: bool) -> Vec<u8> {
+    /// What is new; `with_rest` adds what a person reads rather than sees move. None if there is nothing to tell.
+    pub(super) fn next(&mut self, ward: &Ward, now: Duration, with_rest: bool, reach: Reach) -> Option<Vec<u8>> {
         let Some(bed) = ward.beds.get(&self.bed) else {
-            let reset = self.generation.take().is_some();
-            return frame(&json!({ "kind": "bed", "reset": reset, "bed": self.bed, "known": false, "parts": [] }), &[]);
+            return with_rest.then(|| self.unknown(reach));
         };
         let reset = self.generation != Some(bed.generation());
         if reset {
@@ -88,6 +87,10 @@ impl BedPicture {
         head.insert("now_ns".to_owned(), bed.newest_ns(now).map_or(Value::Null, time));
         let mut parts = Parts::default();
         self.add_waveforms(bed, &mut parts);
+        if parts.is_empty() && !with_rest {
+            return None;
+        }
+        head.insert("connected".to_owned(), json!(reach.connected));
         if with_rest || reset {
             self.add_trends(bed, &mut parts);
             head.insert("quantities".to_owned(), json!(describe::quantities(bed)));
@@ -97,7 +100,15 @@ impl BedPicture {
             head.insert("status".to_owned(), describe::status(bed));
             head.insert("events".to_owned(), self.events(bed));
         }
-        parts.into_frame(Value::Object(head))
+        Some(parts.into_frame(Value::Object(head)))
+    }
+
+    fn unknown(&mut self, reach: Reach) -> Vec<u8> {
+        let (bed, connected) = (&self.bed, reach.connected);
+        self.generation = None;
+        let head =
+            json!({ "kind": "bed", "reset": true, "bed": bed, "known": false, "connected": connected, "parts": [] });
+        frame(&head, &[])
     }
 
     /// The rows of a part that are not sent yet, thinned to the spacing asked for; they count as sent.
