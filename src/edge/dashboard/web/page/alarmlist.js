@@ -41,9 +41,11 @@ export class AlarmList {
     const item = element("li", { "data-priority": alarm.priority, "data-state": alarm.state });
     setAttribute(item, "data-acknowledged", String(Boolean(alarm.acknowledged)));
     const state = alarm.acknowledged ? "active, seen" : alarm.state === "latched" ? "was on" : alarm.state;
+    const what = element("b", { text: alarm.name });
+    const sign = isRaised(alarm) ? signOf(alarm.priority) : "○";
     item.append(
-      element("span", { class: "alarm-sign", text: isRaised(alarm) ? signOf(alarm.priority) : "○", title: `${alarm.priority} priority` }),
-      element("span", { class: "alarm-what" }, element("b", { text: alarm.name }), " ", element("span", { class: "alarm-state", text: state })),
+      element("span", { class: "alarm-sign", text: sign, title: `${alarm.priority} priority` }),
+      element("span", { class: "alarm-what" }, what, " ", element("span", { class: "alarm-state", text: state })),
       element("span", { class: "alarm-text", text: detail(alarm) }),
     );
     if (isRaised(alarm) && !alarm.acknowledged) item.append(this.#button(alarm.name));
@@ -51,7 +53,8 @@ export class AlarmList {
   }
 
   #button(name) {
-    const button = element("button", { type: "button", "data-alarm": name, "aria-label": `Acknowledge ${name}`, text: "Acknowledge" });
+    const attributes = { type: "button", "data-alarm": name, "aria-label": `Acknowledge ${name}`, text: "Acknowledge" };
+    const button = element("button", attributes);
     button.addEventListener("click", () => {
       if (!this.onAcknowledge(name)) button.textContent = "Not sent";
     });

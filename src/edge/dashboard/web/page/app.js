@@ -12,6 +12,10 @@ import { onTheme, startTheme } from "./theme.js";
 import { SPANS_S } from "./viewport.js";
 import { Ward } from "./ward.js";
 
+const SPAN_KEYS = "12345";
+/** An arrow key goes by so much of what is shown. */
+const STEP_SPANS = 0.25;
+
 const meter = new Meter();
 let view = "ward";
 let isDue = false;
@@ -101,24 +105,33 @@ function showKeys() {
   byId("keys").showModal();
 }
 
+const inWard = { views: ["ward"], where: "ward" };
 const inBed = { views: ["bed"], where: "bed" };
-startCommands(
-  [
-    { names: ["↑ ↓ ← →"], keys: ["ArrowDown", "ArrowRight"], text: "move between beds", views: ["ward"], where: "ward", run: () => ward.focus(null) },
-    { names: ["Enter"], keys: [], text: "open the bed", views: ["ward"], where: "ward" },
-    { names: ["/"], keys: ["/"], text: "find a bed by name", views: ["ward"], where: "ward", run: () => byId("filter").focus() },
-    { names: ["Esc"], keys: ["Escape"], text: "back to the ward", ...inBed, run: () => (location.hash = "#ward") },
-    { names: ["Space"], keys: [" "], text: "pause, go on", ...inBed, run: () => bed.viewport.toggle() },
-    { names: ["←", "→"], keys: ["ArrowLeft", "ArrowRight"], text: "back and forth in time", ...inBed, run: (key) => bed.viewport.step(key === "ArrowLeft" ? -0.25 : 0.25) },
-    { names: ["l", "End"], keys: ["l", "End"], text: "back to live", ...inBed, run: () => bed.viewport.live() },
-    { names: ["1 … 5"], keys: ["1", "2", "3", "4", "5"], text: `show ${SPANS_S.join(", ")} s`, ...inBed, run: (key) => bed.viewport.setSpan(SPANS_S[Number(key) - 1]) },
-    { names: ["n"], keys: ["n"], text: "write a note", ...inBed, run: () => byId("note-text").focus() },
-    { names: ["t"], keys: ["t"], text: "light, dark, as the system", where: "everywhere", run: () => byId("theme").click() },
-    { names: ["?"], keys: ["?"], text: "these keys", where: "everywhere", run: showKeys },
-  ],
-  () => view,
-);
+const anywhere = { where: "everywhere" };
 
+const commands = [
+  { names: ["↑ ↓ ← →"], keys: ["ArrowDown", "ArrowRight"], text: "move between beds", ...inWard, run: () => ward.focus(null) },
+  { names: ["Enter"], keys: [], text: "open the bed", ...inWard },
+  { names: ["/"], keys: ["/"], text: "find a bed by name", ...inWard, run: () => byId("filter").focus() },
+  { names: ["Esc"], keys: ["Escape"], text: "back to the ward", ...inBed, run: () => (location.hash = "#ward") },
+  { names: ["Space"], keys: [" "], text: "pause, go on", ...inBed, run: () => bed.viewport.toggle() },
+  { names: ["←", "→"], keys: ["ArrowLeft", "ArrowRight"], text: "back and forth in time", ...inBed, run: stepInTime },
+  { names: ["l", "End"], keys: ["l", "End"], text: "back to live", ...inBed, run: () => bed.viewport.live() },
+  { names: ["1 … 5"], keys: [...SPAN_KEYS], text: `show ${SPANS_S.join(", ")} s`, ...inBed, run: chooseSpan },
+  { names: ["n"], keys: ["n"], text: "write a note", ...inBed, run: () => byId("note-text").focus() },
+  { names: ["t"], keys: ["t"], text: "light, dark, as the system", ...anywhere, run: () => byId("theme").click() },
+  { names: ["?"], keys: ["?"], text: "these keys", ...anywhere, run: showKeys },
+];
+
+function stepInTime(key) {
+  bed.viewport.step(key === "ArrowLeft" ? -STEP_SPANS : STEP_SPANS);
+}
+
+function chooseSpan(key) {
+  bed.viewport.setSpan(SPANS_S[SPAN_KEYS.indexOf(key)]);
+}
+
+startCommands(commands, () => view);
 byId("export-csv").addEventListener("click", exportCsv);
 byId("export-png").addEventListener("click", () => bed.export("png"));
 byId("help").addEventListener("click", showKeys);

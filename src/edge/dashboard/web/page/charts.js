@@ -8,6 +8,9 @@ const TURN_MS = 160;
 /** A chart is not drawn more often than this. */
 const LEAST_AGE_MS = 900;
 
+/** After a chart the strips have the machine for so many times as long as it took. */
+const REST = 5;
+
 let plotly = null;
 
 function load() {
@@ -25,6 +28,7 @@ export class Charts {
   constructor() {
     this.charts = new Set();
     this.isOn = false;
+    this.restUntil = 0;
     this.observer = new IntersectionObserver((entries) => {
       for (const { target, isIntersecting } of entries) target.isInSight = isIntersecting;
     });
@@ -55,13 +59,23 @@ export class Charts {
   }
 
   #turn() {
-    if (!this.isOn || document.hidden) return;
     const now = performance.now();
+    if (!this.isOn || document.hidden || now < this.restUntil) return;
     const due = [...this.charts].filter((chart) => chart.node.isInSight && now - chart.drawnAt > LEAST_AGE_MS);
     if (!due.length) return;
     const chart = due.reduce((one, other) => (other.drawnAt < one.drawnAt ? other : one));
     chart.drawnAt = now;
-    load().then((Plotly) => draw(Plotly, chart), (error) => (chart.node.textContent = error.message));
+    load().then(
+      (Plotly) => this.#draw(Plotly, chart),
+      (error) => (chart.node.textContent = error.message),
+    );
+  }
+
+  #draw(Plotly, chart) {
+    const begin = performance.now();
+    draw(Plotly, chart);
+    const end = performance.now();
+    this.restUntil = end + REST * (end - begin);
   }
 }
 

@@ -7,7 +7,8 @@ export function startCommands(table, view) {
   const dialog = byId("keys");
   for (const { names, text, where } of table) {
     const keys = names.map((name) => element("kbd", { text: name }));
-    byId("key-table").append(element("tr", {}, element("td", {}, ...keys), element("td", { text }), element("td", { class: "quiet", text: where })));
+    const cells = [element("td", {}, ...keys), element("td", { text }), element("td", { class: "quiet", text: where })];
+    byId("key-table").append(element("tr", {}, ...cells));
   }
   // Whoever presses a button with the pointer means Space to pause afterwards, not to press it again.
   document.addEventListener("click", (event) => {

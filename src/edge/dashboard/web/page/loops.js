@@ -35,7 +35,8 @@ export function addLoops(charts, scene) {
 // Points of the last beat before `right`: means and half widths of the bands. Its length is what the heart rate says.
 function lastBeat(history, right, { pressure, volume }) {
   const { estimate } = history;
-  const columns = [pressure, volume].flatMap((name) => ["mean", "low", "high"].map((s) => estimate.column(`${name}.${s}`)));
+  const names = [pressure, volume].flatMap((name) => ["mean", "low", "high"].map((part) => `${name}.${part}`));
+  const columns = names.map((name) => estimate.column(name));
   if (columns.some((column) => !column)) return null;
   const rate = (history.beatAt("heart_rate", right) ?? history.latest.beat?.heart_rate)?.mean;
   const length = rate > 20 && rate < 300 ? 60 / rate : USUAL_BEAT_S;
@@ -83,9 +84,13 @@ function tube(points) {
 function figureOf(points, { volume, pressure, hue }) {
   const closed = [...points, points[0]];
   const common = { type: "scatter", mode: "lines" };
-  const band = { ...common, ...tube(points), fill: "toself", fillcolor: veil(hue, 0.28), line: { width: 0, simplify: false }, hoverinfo: "skip" };
+  const band = {
+    ...common, ...tube(points), fill: "toself", fillcolor: veil(hue, 0.28), hoverinfo: "skip",
+    line: { width: 0, simplify: false },
+  };
   const mean = {
-    ...common, x: closed.map((q) => q.v), y: closed.map((q) => q.p), line: { color: color(hue), width: 2.5, simplify: false },
+    ...common, x: closed.map((q) => q.v), y: closed.map((q) => q.p),
+    line: { color: color(hue), width: 2.5, simplify: false },
     hovertemplate: "%{x:.0f} mL, %{y:.0f} mmHg<extra></extra>",
   };
   const now = points[points.length - 1];

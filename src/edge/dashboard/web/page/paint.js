@@ -155,11 +155,12 @@ function paintSamples(ctx, at, series, picture) {
   if (!series) return 0;
   const [from, to] = visible(series, picture);
   const value = series.column("value");
-  const stride = Math.max(Math.ceil((to - from) / (2 * (picture.width - AXIS_WIDTH))), 1);
+  const stride = Math.max(Math.ceil((to - from) / (picture.width - AXIS_WIDTH)), 1);
   ctx.fillStyle = picture.palette.sample;
   let painted = 0;
   for (let i = from + ((stride - ((from + series.dropped) % stride)) % stride); i < to; i += stride) {
-    const [x, y] = [at.x(series.times[i]), at.y(value[i])];
+    // On whole pixels, where a rectangle costs least.
+    const [x, y] = [Math.round(at.x(series.times[i])), Math.round(at.y(value[i]))];
     if (y < 0) ctx.fillRect(x - 1, 0, 2, 4);
     else if (y > picture.height) ctx.fillRect(x - 1, picture.height - 4, 2, 4);
     else ctx.fillRect(x - 1, y - 1, 2, 2);
@@ -174,7 +175,8 @@ function paintTruth(ctx, at, history, name, picture) {
   const value = truth.column(name);
   const [from, to] = visible(truth, picture);
   if (!value || to <= from) return null;
-  const stride = strideOf((to - from) / (picture.width - AXIS_WIDTH));
+  // Dashes are dear: they make do with half the pixels.
+  const stride = strideOf((2 * (to - from)) / (picture.width - AXIS_WIDTH));
   ctx.strokeStyle = picture.palette.truth;
   ctx.lineWidth = 1;
   ctx.setLineDash([4, 3]);

@@ -24,7 +24,7 @@ export class Tile {
     this.alarms = element("div", { class: "tile-alarms" });
     this.stale = element("div", { class: "tile-stale" });
     this.quality = element("span", { class: "quality" });
-    this.health = element("span", { class: "tile-health" });
+    this.health = element("span", { class: "tile-health", title: "members alive if not all; 99 % of the windows lag less" });
     this.cells = CELLS.map(({ size }) => new Cell(size));
     const label = element("strong", { class: "tile-name", text: name, title: name });
     this.link = element(
