@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use super::bus::{Bus, BusError, Handler, Message, Subscription};
 use super::config::{Config, Timing};
+use super::operator::MAX_AUTHOR;
 use super::wire::{Acknowledge, Beats, FLAG_LAST_BLOCK, PressureBlock, WireError, decode};
 use crate::estimate::time::EventTime;
 use crate::estimate::window::RawSample;
@@ -14,9 +15,6 @@ use crate::runtime::service::{Event, Inlet};
 
 /// Samples accepted in one block.
 const MAX_BLOCK_SAMPLES: usize = 16_384;
-
-/// Longest name of an author \[bytes\].
-const MAX_AUTHOR: usize = 256;
 
 /// Knows which label is which channel.
 struct Decoder {

@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use proptest::prelude::*;
 
 use hemostream::edge::config::{
-    Activation, AlarmPriority, Config, ConfigError, Coupling, Distribution, InitialSd, Origins, Systole, known_keys, render,
+    Activation, AlarmPriority, Config, ConfigError, Coupling, Distribution, InitialSd, Origins, Systole, known_keys,
+    render,
 };
 use hemostream::estimate::alarm::{Limit, Watched};
 use hemostream::model::Model;
