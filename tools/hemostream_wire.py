@@ -694,6 +694,165 @@ class Event:
         return self.header.content() | {"kind": self.kind, "channel": self.channel, "text": self.text}
 
 
+@dataclass(frozen=True)
+class Alarm:
+    """One alarm of a bed in `Alarms`."""
+
+    name: str
+    """Its name in the configuration."""
+    quantity: str
+    """Quantity, parameter or clinical quantity that it watches."""
+    unit: str
+    """Unit of `limit` and of the band; empty for a ratio."""
+    priority: str
+    """low, medium or high."""
+    state: str
+    """normal, pending (beyond the limit, not yet long enough), active, or latched (over, not acknowledged)."""
+    acknowledged: bool
+    """Whether an operator has seen it; false unless it is active."""
+    side: str
+    """below or above."""
+    limit: float
+    """The limit."""
+    since_ns: int
+    """Event time since which it is in this state [ns]."""
+    band: tuple[float, float, float]
+    """The band when it last changed: mean, 5 and 95 % quantile; NaN before anything has happened."""
+    text: str
+    """For people: what is the matter; empty while it is normal."""
+
+    MIN_BYTES: ClassVar[int] = 7 * 8 + 1 + 8 + 8 + 3 * 8
+    """On the wire, with empty strings."""
+
+    @classmethod
+    def read(cls, cursor: Cursor) -> Self:
+        return cls(
+            name=cursor.string(),
+            quantity=cursor.string(),
+            unit=cursor.string(),
+            priority=cursor.string(),
+            state=cursor.string(),
+            acknowledged=cursor.boolean(),
+            side=cursor.string(),
+            limit=cursor.f64(),
+            since_ns=cursor.i64(),
+            band=(cursor.f64(), cursor.f64(), cursor.f64()),
+            text=cursor.string(),
+        )
+
+    @classmethod
+    def read_json(cls, body: Mapping[str, Any]) -> Self:
+        band = _shaped(_floats(_list(body, "band"), "band"), (3,), "band")
+        return cls(
+            name=_string(body, "name"),
+            quantity=_string(body, "quantity"),
+            unit=_string(body, "unit"),
+            priority=_string(body, "priority"),
+            state=_string(body, "state"),
+            acknowledged=_boolean(body, "acknowledged"),
+            side=_string(body, "side"),
+            limit=_float(body, "limit"),
+            since_ns=_integer(body, "since_ns"),
+            band=(float(band[0]), float(band[1]), float(band[2])),
+            text=_string(body, "text"),
+        )
+
+    def content(self) -> Content:
+        return dict(vars(self)) | {"band": np.array(self.band)}
+
+
+@dataclass(frozen=True)
+class Alarms:
+    """What stands against the limits of a bed, whenever an alarm changes (key `alarm`)."""
+
+    KEY: ClassVar[str] = "alarm"
+
+    header: Header
+    alarms: tuple[Alarm, ...]
+    """One per alarm of the configuration, in its order."""
+
+    @classmethod
+    def read(cls, cursor: Cursor) -> Self:
+        header = Header.read(cursor)
+        return cls(header, tuple(Alarm.read(cursor) for _ in range(cursor.length(Alarm.MIN_BYTES))))
+
+    @classmethod
+    def read_json(cls, body: Mapping[str, Any]) -> Self:
+        alarms = _list(body, "alarms")
+        if not all(isinstance(alarm, dict) for alarm in alarms):
+            raise Malformed("`alarms` holds something that is not an object")
+        return cls(Header.read_json(body), tuple(Alarm.read_json(alarm) for alarm in alarms))
+
+    def content(self) -> Content:
+        alarms = {f"alarms[{i}].{k}": v for i, a in enumerate(self.alarms) for k, v in a.content().items()}
+        return self.header.content() | alarms
+
+
+@dataclass(frozen=True)
+class Acknowledge:
+    """An operator has seen an alarm (key `acknowledge`, towards the estimator)."""
+
+    alarm: str = ""
+    """Name of the alarm; empty for all of the bed."""
+    author: str = ""
+    """Who; for the record."""
+    schema: int = SCHEMA
+
+    def encode(self) -> bytes:
+        """The bincode bytes."""
+        payload = struct.pack("<H", self.schema) + _encode_string(self.alarm) + _encode_string(self.author)
+        _check_length(payload)
+        return payload
+
+    @classmethod
+    def read(cls, cursor: Cursor) -> Self:
+        return cls(schema=cursor.u16(), alarm=cursor.string(), author=cursor.string())
+
+    @classmethod
+    def read_json(cls, body: Mapping[str, Any]) -> Self:
+        return cls(_string(body, "alarm"), _string(body, "author"), _integer(body, "schema"))
+
+    def content(self) -> Content:
+        return dict(vars(self))
+
+
+@dataclass(frozen=True)
+class Note:
+    """What an operator says about a bed (key `note`)."""
+
+    KEY: ClassVar[str] = "note"
+
+    time_ns: int
+    """Event time that it is about [ns]."""
+    author: str
+    """Who."""
+    text: str
+    """What."""
+    schema: int = SCHEMA
+
+    def encode(self) -> bytes:
+        """The bincode bytes."""
+        try:
+            head = struct.pack("<Hq", self.schema, self.time_ns)
+        except struct.error as error:
+            raise Malformed(f"a field does not fit: {error}") from error
+        payload = head + _encode_string(self.author) + _encode_string(self.text)
+        _check_length(payload)
+        return payload
+
+    @classmethod
+    def read(cls, cursor: Cursor) -> Self:
+        return cls(schema=cursor.u16(), time_ns=cursor.i64(), author=cursor.string(), text=cursor.string())
+
+    @classmethod
+    def read_json(cls, body: Mapping[str, Any]) -> Self:
+        time_ns, schema = _integer(body, "time_ns"), _integer(body, "schema")
+        return cls(time_ns, _string(body, "author"), _string(body, "text"), schema)
+
+    def content(self) -> Content:
+        return dict(vars(self))
+
+
 @dataclass(frozen=True, eq=False)
 class Truth:
     """What a synthetic patient really is (key `truth`)."""
@@ -737,6 +896,11 @@ def _check_schema(version: int) -> None:
 
 def _encode_array(values: Integers | Floats, layout: str) -> bytes:
     return struct.pack("<Q", len(values)) + np.asarray(values).astype(layout).tobytes()
+
+
+def _encode_string(text: str) -> bytes:
+    encoded = text.encode()
+    return struct.pack("<Q", len(encoded)) + encoded
 
 
 def _read_by_name(cursor: Cursor, read: Callable[[], T]) -> dict[str, T]:

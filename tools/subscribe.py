@@ -1,4 +1,4 @@
-"""Follows hemostream estimates live: one line per bed and second, beats and events as they come, rows to a CSV file."""
+"""Follows hemostream live: a line per bed and second, beats, events, alarms and notes as they come, rows to a file."""
 
 from __future__ import annotations
 
@@ -22,9 +22,11 @@ from hemostream_rows import ColumnsChanged, RowFile
 from hemostream_twins import TwinCheck
 from hemostream_wire import (
     SMOOTHED_KEY,
+    Alarms,
     BeatEstimate,
     Event,
     Header,
+    Note,
     ParameterEstimate,
     StateEstimate,
     Status,
@@ -40,7 +42,7 @@ except ImportError as missing:
 
 OK, FAILED, USAGE = 0, 1, 2
 
-Published = StateEstimate | ParameterEstimate | BeatEstimate | Status | Event
+Published = StateEstimate | ParameterEstimate | BeatEstimate | Status | Event | Alarms
 KINDS: dict[str, type[Published]] = {
     StateEstimate.KEY: StateEstimate,
     ParameterEstimate.KEY: ParameterEstimate,
@@ -48,6 +50,7 @@ KINDS: dict[str, type[Published]] = {
     BeatEstimate.KEY: BeatEstimate,
     Status.KEY: Status,
     Event.KEY: Event,
+    Alarms.KEY: Alarms,
 }
 
 UNDECODABLE = "undecodable messages"
@@ -166,6 +169,7 @@ class Bed:
     state: StateEstimate | None = None
     parameters: ParameterEstimate | None = None
     status: Status | None = None
+    alarms: Alarms | None = None
     heard_s: float = 0.0
     """When the last state came, on the monotonic clock."""
 
@@ -177,11 +181,14 @@ class Bed:
                 self.parameters = message
             case Status():
                 self.status = message
+            case Alarms():
+                self.alarms = message
 
     def line(self, name: str, now_s: float) -> str:
         parts = [name, *self._estimate()]
         lag = self.status.lag_p99_ms if self.status else math.nan
         parts.append(f"lag p99 {lag:.1f} ms" if math.isfinite(lag) else "lag p99 -")
+        parts += self._raised()
         silent_s = now_s - self.heard_s
         if self.state and silent_s > SILENT_AFTER_S:
             parts.append(f"SILENT for {silent_s:.0f} s")
@@ -195,6 +202,12 @@ class Bed:
                 mark = "" if p.is_identifiable(n) else " (not identifiable)"
                 parts.append(banded(n, [p.value(n, s) for s in BAND], "#.4g") + mark)
         return parts
+
+    def _raised(self) -> list[str]:
+        """Alarms that are raised, or were and are not acknowledged."""
+        marks = {"active": "", "latched": " (over)"}
+        raised = [a for a in (self.alarms.alarms if self.alarms else ()) if a.state in marks]
+        return [f"ALARM {a.name}{' (seen)' if a.acknowledged else marks[a.state]}" for a in raised]
 
     @staticmethod
     def _pressures(state: StateEstimate) -> list[str]:
@@ -227,6 +240,9 @@ class Follower:
     def handle(self, received: Received, now_s: float) -> None:
         bed, topic, is_json = split_key(self._prefix, received.key)
         self.received += 1
+        if topic == Note.KEY:
+            self._note(received, bed)
+            return
         try:
             message = (from_json if is_json else decode)(KINDS[topic], received.payload)
         except WireError as error:
@@ -239,6 +255,13 @@ class Follower:
             if is_json:
                 return
         self._take(bed, topic, message, now_s)
+
+    def _note(self, received: Received, bed: str) -> None:
+        """What an operator says; it has no header and no twin."""
+        try:
+            print(note_line(bed, decode(Note, received.payload)), flush=True)
+        except WireError as error:
+            self._complain(UNDECODABLE, f"{received.key}: {error}")
 
     def print_lines(self, now_s: float) -> None:
         for name in sorted(self.beds):
@@ -293,6 +316,9 @@ class Follower:
             print(event_line(bed, message), flush=True)
         elif isinstance(message, BeatEstimate):
             print(beat_line(bed, message), flush=True)
+        elif isinstance(message, Alarms):
+            for line in alarm_lines(bed, message):
+                print(line, flush=True)
         if self._rows is None or not isinstance(message, StateEstimate | ParameterEstimate):
             return
         self._rows_bed = self._rows_bed or bed
@@ -333,6 +359,25 @@ def event_time(time_ns: int) -> str:
 def event_line(bed: str, event: Event) -> str:
     channel = f" {event.channel}" if event.channel else ""
     return printable(f"{bed}  {event_time(event.header.time_ns)}  EVENT {event.kind}{channel}: {event.text}")
+
+
+def alarm_lines(bed: str, alarms: Alarms) -> list[str]:
+    """A line per alarm that is not normal, most urgent first; one that says so if all are."""
+    urgency = ("high", "medium", "low")
+    moved = [alarm for alarm in alarms.alarms if alarm.state != "normal"]
+    moved.sort(key=lambda alarm: urgency.index(alarm.priority) if alarm.priority in urgency else len(urgency))
+    start = f"{bed}  {event_time(alarms.header.time_ns)}  ALARM"
+    if not moved:
+        return [printable(f"{start} none of {len(alarms.alarms)}")]
+    return [
+        printable(f"{start} {a.priority} {a.name}: {a.state}{', acknowledged' if a.acknowledged else ''}: {a.text}")
+        for a in moved
+    ]
+
+
+def note_line(bed: str, note: Note) -> str:
+    by = f" by {note.author}" if note.author else ""
+    return printable(f"{bed}  {event_time(note.time_ns)}  NOTE{by}: {note.text}")
 
 
 def beat_line(bed: str, beat: BeatEstimate) -> str:
@@ -426,7 +471,9 @@ def client_config(endpoint: str) -> zenoh.Config:
 
 def patterns(arguments: argparse.Namespace) -> list[str]:
     endings = {"bincode": [""], "json": ["/json"], "both": ["", "/json"]}[arguments.format]
-    return [f"{arguments.prefix}/{arguments.bed or '*'}/{topic}{end}" for topic in KINDS for end in endings]
+    bed = f"{arguments.prefix}/{arguments.bed or '*'}"
+    # Notes have no JSON twin.
+    return [f"{bed}/{topic}{end}" for topic in KINDS for end in endings] + [f"{bed}/{Note.KEY}"]
 
 
 def subscribe(session: zenoh.Session, keys: list[str], intake: Intake) -> None:

@@ -15,12 +15,16 @@ from hemostream_wire import (
     MAX_PAYLOAD_BYTES,
     PARAMETER_STATISTICS,
     STATE_STATISTICS,
+    Acknowledge,
+    Alarm,
+    Alarms,
     BeatEstimate,
     Beats,
     ChannelStatus,
     Event,
     Malformed,
     Members,
+    Note,
     ParameterEstimate,
     PressureBlock,
     StateEstimate,
@@ -207,6 +211,70 @@ STATUS_JSON: dict[str, Any] = HEADER_JSON | {
 EVENT = HEADER + bytes.fromhex("0300000000000000") + b"gap" + text("p_a") + text("nichts für 2 s")
 EVENT_JSON = HEADER_JSON | {"kind": "gap", "channel": "p_a", "text": "nichts für 2 s"}
 
+# Active and seen; and one that has not seen anything yet.
+ALARMS = (
+    HEADER
+    + u64(2)
+    + text("low output")
+    + text("cardiac_output")
+    + text("L/min")
+    + text("high")
+    + text("active")
+    + b"\x01"
+    + text("below")
+    + f64(4.0)
+    + struct.pack("<q", 1_490_000_000)
+    + f64(3.2, 2.9, 3.5)
+    + text("cardiac output below 4 L/min")
+    + text("weak heart")
+    + text("ejection_fraction")
+    + text("")
+    + text("low")
+    + text("normal")
+    + b"\x00"
+    + text("above")
+    + f64(0.8)
+    + struct.pack("<q", -1)
+    + f64(math.nan, math.nan, math.nan)
+    + text("")
+)
+ALARMS_JSON: dict[str, Any] = HEADER_JSON | {
+    "alarms": [
+        {
+            "name": "low output",
+            "quantity": "cardiac_output",
+            "unit": "L/min",
+            "priority": "high",
+            "state": "active",
+            "acknowledged": True,
+            "side": "below",
+            "limit": 4.0,
+            "since_ns": 1_490_000_000,
+            "band": [3.2, 2.9, 3.5],
+            "text": "cardiac output below 4 L/min",
+        },
+        {
+            "name": "weak heart",
+            "quantity": "ejection_fraction",
+            "unit": "",
+            "priority": "low",
+            "state": "normal",
+            "acknowledged": False,
+            "side": "above",
+            "limit": 0.8,
+            "since_ns": -1,
+            "band": [None, None, None],
+            "text": "",
+        },
+    ]
+}
+
+ACKNOWLEDGE = bytes.fromhex("0200") + text("low output") + text("Dr. Müller")
+ACKNOWLEDGE_JSON = {"schema": 2, "alarm": "low output", "author": "Dr. Müller"}
+
+NOTE = bytes.fromhex("0200 002f685900000000") + text("") + text("250 mL")
+NOTE_JSON = {"schema": 2, "time_ns": 1_500_000_000, "author": "", "text": "250 mL"}
+
 TRUTH = bytes.fromhex("0200 ffffffffffffffff") + texts("p_a", "r_pv") + floats(91.5, 0.08)
 TRUTH_JSON = {"schema": 2, "time_ns": -1, "names": ["p_a", "r_pv"], "values": {"p_a": 91.5, "r_pv": 0.08}}
 
@@ -228,6 +296,9 @@ ALL: list[tuple[type[Any], bytes, dict[str, Any]]] = [
     (Members, MEMBERS, MEMBERS_JSON),
     (Status, STATUS, STATUS_JSON),
     (Event, EVENT, EVENT_JSON),
+    (Alarms, ALARMS, ALARMS_JSON),
+    (Acknowledge, ACKNOWLEDGE, ACKNOWLEDGE_JSON),
+    (Note, NOTE, NOTE_JSON),
     (Truth, TRUTH, TRUTH_JSON),
 ]
 
@@ -317,6 +388,34 @@ class Contents(unittest.TestCase):
         members = decode(Members, MEMBERS)
         self.assertEqual(members.names, ("p_l", "p_a", "r_pv"))
         np.testing.assert_array_equal(members.values, [[1, 2, 3], [4, 5, 6]])
+
+    def test_alarms(self) -> None:
+        low, weak = decode(Alarms, ALARMS).alarms
+        self.assertEqual((low.name, low.quantity, low.unit), ("low output", "cardiac_output", "L/min"))
+        self.assertEqual(low.priority, "high")
+        self.assertEqual((low.state, low.acknowledged, low.side, low.limit), ("active", True, "below", 4.0))
+        self.assertEqual((low.since_ns, low.band), (1_490_000_000, (3.2, 2.9, 3.5)))
+        self.assertEqual(low.text, "cardiac output below 4 L/min")
+        self.assertEqual((weak.state, weak.acknowledged, weak.since_ns), ("normal", False, -1))
+        self.assertTrue(all(map(math.isnan, weak.band)))
+
+    def test_alarm_has_a_band_of_three(self) -> None:
+        for band in ([1.0, 2.0], [1.0, 2.0, 3.0, 4.0]):
+            with self.subTest(band=band), self.assertRaisesRegex(Malformed, "`band` has . entries, expected 3"):
+                Alarm.read_json(ALARMS_JSON["alarms"][0] | {"band": band})
+
+    def test_acknowledge_and_note_are_encoded_as_they_are_decoded(self) -> None:
+        seen = decode(Acknowledge, ACKNOWLEDGE)
+        self.assertEqual((seen.alarm, seen.author), ("low output", "Dr. Müller"))
+        self.assertEqual(Acknowledge("low output", "Dr. Müller").encode(), ACKNOWLEDGE)
+        self.assertEqual(Acknowledge().encode(), bytes.fromhex("0200") + u64(0) + u64(0))
+        note = decode(Note, NOTE)
+        self.assertEqual((note.time_ns, note.author, note.text), (1_500_000_000, "", "250 mL"))
+        self.assertEqual(note.encode(), NOTE)
+        with self.assertRaises(TooLong):
+            Note(0, "", "x" * MAX_PAYLOAD_BYTES).encode()
+        with self.assertRaisesRegex(Malformed, "does not fit"):
+            Note(1 << 63, "", "").encode()
 
     def test_status(self) -> None:
         status = decode(Status, STATUS)

@@ -26,8 +26,10 @@ from hemostream_wire import (
     PARAMETER_STATISTICS,
     SMOOTHED_KEY,
     STATE_STATISTICS,
+    Alarms,
     BeatEstimate,
     Event,
+    Note,
     ParameterEstimate,
     StateEstimate,
     Status,
@@ -153,6 +155,18 @@ def event_bytes(sequence: int, time_ns: int, words: str) -> bytes:
 
 def event_json(sequence: int, time_ns: int, words: str) -> dict[str, Any]:
     return header_json(sequence, time_ns) | {"kind": "gap", "channel": "p_a", "text": words}
+
+
+def alarm_json(sequence: int, time_ns: int, state: str) -> dict[str, Any]:
+    alarm = {"name": "low output", "quantity": "cardiac_output", "unit": "L/min", "priority": "high", "state": state}
+    alarm |= {"acknowledged": False, "side": "below", "limit": 4.0, "since_ns": time_ns, "band": [3.2, 2.9, 3.5]}
+    return header_json(sequence, time_ns) | {"alarms": [alarm | {"text": "too little"}]}
+
+
+def alarm_bytes(sequence: int, time_ns: int, state: str) -> bytes:
+    words = [text(word) for word in ("low output", "cardiac_output", "L/min", "high", state)]
+    band = f64(4.0) + struct.pack("<q", time_ns) + f64(3.2, 2.9, 3.5)
+    return header(sequence, time_ns) + u64(1) + b"".join(words) + b"\0" + text("below") + band + text("too little")
 
 
 def status_bytes(sequence: int, time_ns: int) -> bytes:
@@ -342,6 +356,19 @@ class Parts(unittest.TestCase):
         event = decode(Event, event_bytes(1, 0, "\x1b[2Jgone\n"))
         self.assertEqual(subscribe.event_line("bed1", event), "bed1  0.000 s  EVENT gap p_a: ?[2Jgone?")
 
+    def test_alarm_lines(self) -> None:
+        lines = {state: from_json(Alarms, json.dumps(alarm_json(0, 0, state))) for state in ("normal", "latched")}
+        self.assertEqual(subscribe.alarm_lines("bed1", lines["normal"]), ["bed1  0.000 s  ALARM none of 1"])
+        latched = ["bed1  0.000 s  ALARM high low output: latched: too little"]
+        self.assertEqual(subscribe.alarm_lines("bed1", lines["latched"]), latched)
+        bed = subscribe.Bed(alarms=lines["latched"])
+        self.assertEqual(bed.line("bed1", 0.0), "bed1  no state yet  lag p99 -  ALARM low output (over)")
+        bed.take(lines["normal"], 0.0)
+        self.assertNotIn("ALARM", bed.line("bed1", 0.0))
+
+    def test_note_line(self) -> None:
+        self.assertEqual(subscribe.note_line("bed1", Note(0, "", "a\x1bb")), "bed1  0.000 s  NOTE: a?b")
+
     def test_live_line(self) -> None:
         bed = subscribe.Bed()
         self.assertEqual(bed.line("bed1", 0.0), "bed1  no state yet  lag p99 -")
@@ -503,12 +530,17 @@ class Loopback(InDirectory):
                     self.publish(sequence, time_ns)
             self.publisher.put(SMOOTHED_KEY, smoothed_bytes(1, 5), smoothed_json(1, 5))
             self.publisher.put("estimate/beat", beat_bytes(1, 1_000_000_000), beat_json(1, 1_000_000_000))
+            self.publisher.put("alarm", alarm_bytes(0, 5, "active"), alarm_json(0, 5, "active"))
+            self.publisher.put("note", Note(5, "Dr. Weber", "250 mL").encode())
             self.publisher.put("event", event_bytes(0, 5, "over"), event_json(0, 5, "over"))
             last = f"{parameter_values(times[-1])[0]:#.4g}"
             seen = self.read_until(process, lambda line: "0.980 s" in line and last in line)
             code, complaints = self.interrupt(process)
         self.assertEqual(code, 0, complaints)
         self.assertIn("bed1  0.000 s  EVENT gap p_a: over", seen)
+        self.assertIn("bed1  0.000 s  ALARM high low output: active: too little", seen)
+        self.assertIn("bed1  0.000 s  NOTE by Dr. Weber: 250 mL", seen)
+        self.assertIn("ALARM low output", seen[-1])
         self.assertEqual(seen.count(BEAT_LINE), 1)
         self.assertIn("lag p99 3.2 ms", seen[-1])
         self.assertRegex(complaints, r"\b(9[89]|10\d) pairs compared, 0 differ, 0 messages without twin")

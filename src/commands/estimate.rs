@@ -37,7 +37,8 @@ pub(crate) struct Estimate {
     /// Where to write what is read off each heart beat (CSV): stroke volume, cardiac output, resistances, pressures
     #[arg(long, value_name = "FILE")]
     beats: Option<PathBuf>,
-    /// Where to write what happened (CSV): artefacts, beats missed, parameters that moved, a model that does not fit
+    /// Where to write what happened (CSV): alarms, artefacts, beats missed, parameters that moved, a model that
+    /// does not fit
     #[arg(long, value_name = "FILE")]
     events: Option<PathBuf>,
     /// Worker threads, over the configuration; 0 is one per core
@@ -182,7 +183,8 @@ impl Run {
                         table.row(&beat_row(&beat))?;
                     }
                 }
-                Output::Estimate(_) => {}
+                // Their notices say the same.
+                Output::Estimate(_) | Output::Alarms(_) => {}
                 Output::Window(window) => {
                     self.windows += 1;
                     self.iterations += window.report.iterations as u64;
@@ -194,7 +196,7 @@ impl Run {
                     let (channel, model) = (notice.channel, self.bed.estimator().model());
                     let name =
                         channel.map_or("", |c| model.states()[self.bed.estimator().settings().channels[c].state].name);
-                    let text = notice_text(model, notice.kind);
+                    let text = notice_text(model, &notice);
                     if let Some(events) = &mut self.events {
                         events.row(notice.time, notice.kind.name(), name, &text)?;
                     }

@@ -1,9 +1,11 @@
 //! The commands: arguments, exit codes, and what is printed. The work is done by the library.
 
+mod acknowledge;
 mod config;
 mod dashboard;
 mod demo;
 mod estimate;
+mod note;
 mod replay;
 mod reproduce;
 mod serve;
@@ -19,6 +21,7 @@ use clap::{Args, Parser, Subcommand};
 use hemostream::edge::bus::BusError;
 use hemostream::edge::config::{Config, ConfigError, Origins};
 use hemostream::edge::files::error::FileError;
+use hemostream::edge::operator::OperatorError;
 use hemostream::edge::replay::ReplayError;
 use indicatif::{ProgressBar, ProgressStyle};
 
@@ -40,6 +43,8 @@ enum Command {
     Replay(replay::Replay),
     Watch(watch::Watch),
     Dashboard(dashboard::Dashboard),
+    Acknowledge(acknowledge::Acknowledge),
+    Note(note::Note),
     Simulate(simulate::Simulate),
     Estimate(estimate::Estimate),
     Validate(validate::Validate),
@@ -100,6 +105,12 @@ impl From<ReplayError> for Failure {
     }
 }
 
+impl From<OperatorError> for Failure {
+    fn from(error: OperatorError) -> Self {
+        if error.is_input() { Self::Input(error.to_string()) } else { Self::Failed(error.to_string()) }
+    }
+}
+
 /// Something the program itself could not do.
 pub(crate) fn failed(error: impl std::fmt::Display) -> Failure {
     Failure::Failed(error.to_string())
@@ -133,6 +144,8 @@ pub(crate) fn main() -> ExitCode {
         Command::Replay(command) => command.run(),
         Command::Watch(command) => command.run(),
         Command::Dashboard(command) => command.run(),
+        Command::Acknowledge(command) => command.run(),
+        Command::Note(command) => command.run(),
         Command::Simulate(command) => command.run(),
         Command::Estimate(command) => command.run(),
         Command::Validate(command) => command.run(),

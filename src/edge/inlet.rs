@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use super::bus::{Bus, BusError, Handler, Message, Subscription};
 use super::config::{Config, Timing};
-use super::wire::{Beats, FLAG_LAST_BLOCK, PressureBlock, WireError, decode};
+use super::operator::MAX_AUTHOR;
+use super::wire::{Acknowledge, Beats, FLAG_LAST_BLOCK, PressureBlock, WireError, decode};
 use crate::estimate::time::EventTime;
 use crate::estimate::window::RawSample;
 use crate::model::Model;
@@ -24,6 +25,8 @@ struct Decoder {
     ignored: Vec<String>,
     /// Whether beats are told.
     told: bool,
+    /// Names of the alarms.
+    alarms: Vec<String>,
 }
 
 impl Decoder {
@@ -42,7 +45,8 @@ impl Decoder {
             }
         }
         let told = config.estimator.timing == Timing::Beats;
-        Self { prefix: config.publish.prefix.clone(), labels, ignored, told }
+        let alarms = config.alarms.iter().map(|alarm| alarm.name.clone()).collect();
+        Self { prefix: config.publish.prefix.clone(), labels, ignored, told, alarms }
     }
 
     /// The bed and what to do; None for what is not meant for this service.
@@ -50,6 +54,11 @@ impl Decoder {
         let rest = message.key.strip_prefix(&self.prefix)?.strip_prefix('/')?;
         if let Some(bed) = rest.strip_suffix("/beat") {
             let task = if self.told { beats(message).unwrap_or_else(Task::Refused) } else { return None };
+            return Some(Event::Task { bed: bed.to_owned(), task });
+        }
+        // A label may be called so as well.
+        if let Some(bed) = rest.strip_suffix("/acknowledge").filter(|bed| !bed.contains('/')) {
+            let task = self.acknowledge(message).unwrap_or_else(Task::Refused);
             return Some(Event::Task { bed: bed.to_owned(), task });
         }
         let (bed, channel) = rest.split_once("/pressure/")?;
@@ -61,6 +70,19 @@ impl Decoder {
             Some((_, channel)) => task(message, *channel).unwrap_or_else(Task::Refused),
         };
         Some(Event::Task { bed: bed.to_owned(), task })
+    }
+
+    fn acknowledge(&self, message: &Message) -> Result<Task, &'static str> {
+        let Acknowledge { alarm, author, .. } =
+            decode(&message.payload, message.encoding).map_err(|error| refusal(&error))?;
+        if author.len() > MAX_AUTHOR {
+            return Err("oversized");
+        }
+        let alarm = Some(alarm).filter(|name| !name.is_empty());
+        if alarm.as_ref().is_some_and(|name| !self.alarms.contains(name)) {
+            return Err("unknown_alarm");
+        }
+        Ok(Task::Acknowledge { alarm, author })
     }
 }
 
@@ -113,14 +135,14 @@ fn samples(block: &PressureBlock) -> Option<Vec<RawSample>> {
     block.values.iter().enumerate().map(sample).collect()
 }
 
-/// Listens to the pressures of all beds, and to their beats where these are told.
+/// Listens to the pressures of all beds and to those who acknowledge alarms, and to beats where these are told.
 ///
 /// # Errors
 /// When the bus does not take the subscription.
 pub fn listen(bus: &dyn Bus, config: &Config, inlet: Inlet) -> Result<Vec<Subscription>, BusError> {
     let decoder = Decoder::new(config);
     let prefix = &config.publish.prefix;
-    let mut patterns = vec![format!("{prefix}/*/pressure/*")];
+    let mut patterns = vec![format!("{prefix}/*/pressure/*"), format!("{prefix}/*/acknowledge")];
     if decoder.told {
         patterns.push(format!("{prefix}/*/beat"));
     }

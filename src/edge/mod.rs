@@ -9,6 +9,7 @@ pub mod config;
 pub mod dashboard;
 pub mod files;
 pub mod inlet;
+pub mod operator;
 pub mod outlet;
 pub mod replay;
 pub mod scoreboard;

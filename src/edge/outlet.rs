@@ -14,10 +14,12 @@ use serde::de::DeserializeOwned;
 use super::bus::{self, Bus, BusError, Delivery, Encoding, Message, Subscription};
 use super::config::Config;
 use super::wire::{
-    self, BeatEstimate, ChannelStatus, Event, Header, Members, ParameterEstimate, SCHEMA, StateEstimate, Status, ToJson,
+    self, Alarm, Alarms, BeatEstimate, ChannelStatus, Event, Header, Members, ParameterEstimate, SCHEMA, StateEstimate,
+    Status, ToJson,
 };
+use crate::estimate::alarm::{AlarmReport, AlarmSettings};
 use crate::estimate::beat;
-use crate::estimate::estimator::{Estimate, Notice, NoticeKind, Output};
+use crate::estimate::estimator::{AlarmsNow, Estimate, Notice, NoticeKind, Output};
 use crate::estimate::signal::quality::Artefact;
 use crate::estimate::statistics::Summary;
 use crate::estimate::time::{EventTime, s_from_ns};
@@ -179,12 +181,20 @@ impl Outlet {
 
     fn notice(&self, bed: &str, channels: &[&str], notice: &Notice) {
         let channel = notice.channel.and_then(|c| channels.get(c)).copied().unwrap_or_default();
-        let (kind, text) = (notice.kind.name(), notice_text(&self.model, notice.kind));
+        let (kind, text) = (notice.kind.name(), notice_text(&self.model, notice));
         tracing::info!(bed, kind, channel, time_s = notice.time.as_s(), "{text}");
         let key = self.key(bed, "event");
         let header = self.header(&key, notice.time);
         let event = Event { header, kind: kind.to_owned(), channel: channel.to_owned(), text };
         self.send(key, &event, Delivery::Events);
+    }
+
+    fn alarms(&self, bed: &Bed, now: &AlarmsNow) {
+        let key = self.key(&bed.name, "alarm");
+        let settings = &bed.estimator().settings().live.alarms;
+        let alarms = settings.iter().zip(&now.alarms).map(|(alarm, report)| alarm_message(&self.model, alarm, report));
+        let message = Alarms { header: self.header(&key, now.time), alarms: alarms.collect() };
+        self.send(key, &message, Delivery::Events);
     }
 
     fn status(&self, bed: &Bed, health: &Health) {
@@ -214,6 +224,7 @@ impl Sink for Outlet {
                 Output::Notice(notice) => self.notice(&bed.name, &channels, notice),
                 Output::Smoothed(estimate) => self.smoothed(bed, estimate),
                 Output::Beat(beat) => self.beat(bed, beat),
+                Output::Alarms(now) => self.alarms(bed, now),
                 Output::Window(_) => {}
             }
         }
@@ -297,6 +308,8 @@ fn to_json(key: &str, payload: &[u8]) -> Option<Vec<u8>> {
         twin::<Status>(payload)
     } else if key.ends_with("/event") {
         twin::<Event>(payload)
+    } else if key.ends_with("/alarm") {
+        twin::<Alarms>(payload)
     } else {
         None
     }
@@ -308,10 +321,28 @@ fn count(n: usize) -> u32 {
 
 /// What happened, for people: with the name of the parameter, which the core does not write.
 #[must_use]
-pub fn notice_text(model: &Circulation, kind: NoticeKind) -> String {
-    match kind {
-        NoticeKind::ParameterShift(p) => format!("{} has begun to move", model.parameters()[p].name),
-        other => other.text(),
+pub fn notice_text(model: &Circulation, notice: &Notice) -> String {
+    match (&notice.text, notice.kind) {
+        (Some(text), _) => text.clone(),
+        (None, NoticeKind::ParameterShift(p)) => format!("{} has begun to move", model.parameters()[p].name),
+        (None, other) => other.text(),
+    }
+}
+
+fn alarm_message(model: &Circulation, settings: &AlarmSettings, report: &AlarmReport) -> Alarm {
+    let quantity = settings.watched.info(model);
+    Alarm {
+        name: settings.name.clone(),
+        quantity: quantity.name.to_owned(),
+        unit: quantity.unit.to_owned(),
+        priority: settings.priority.name().to_owned(),
+        state: report.state.name().to_owned(),
+        acknowledged: report.acknowledged,
+        side: settings.limit.side().to_owned(),
+        limit: settings.limit.value(),
+        since_ns: report.since.0,
+        band: [report.band.mean, report.band.q05, report.band.q95],
+        text: settings.text(model, report),
     }
 }
 

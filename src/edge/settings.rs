@@ -1,6 +1,7 @@
 //! From the configuration to what the core wants to know.
 
 use super::config::{self, Config, ConfigError, DiscrepancyForm, DiscrepancySettings};
+use crate::estimate::alarm::{AlarmSettings, Limit, Priority, Watched};
 use crate::estimate::settings::{
     Adaptation, Belief, ChannelSettings, CouplingKind, Drift, EstimatorSettings, LiveSettings, RowWeights,
     WindowSettings,
@@ -170,9 +171,34 @@ impl Config {
                     config::SecondOpinion::Ukf => Some(CouplingKind::Ukf),
                     config::SecondOpinion::Enkf => Some(CouplingKind::Enkf),
                 },
+                alarms: self.watched_limits()?,
             },
             publish_period_ns: ns_from_s(1.0 / self.publish.rate_hz),
         })
+    }
+
+    /// Limits that are watched, in their order; what [`Config::check`] refuses is left out.
+    fn watched_limits(&self) -> Result<Vec<AlarmSettings>, ConfigError> {
+        let model = self.circulation()?;
+        let alarm = |alarm: &config::AlarmSettings| {
+            let limit = alarm.below.map(Limit::Below).or(alarm.above.map(Limit::Above))?;
+            Some(AlarmSettings {
+                name: alarm.name.clone(),
+                watched: Watched::by_name(&model, &alarm.quantity)?,
+                limit,
+                probability: alarm.probability,
+                for_ns: ns_from_s(alarm.for_s),
+                clear_margin: alarm.clear_margin,
+                clear_for_ns: ns_from_s(alarm.clear_for_s),
+                priority: match alarm.priority {
+                    config::AlarmPriority::Low => Priority::Low,
+                    config::AlarmPriority::Medium => Priority::Medium,
+                    config::AlarmPriority::High => Priority::High,
+                },
+                latched: alarm.latched,
+            })
+        };
+        Ok(self.alarms.iter().filter_map(alarm).collect())
     }
 
     /// What is believed of each parameter: of all the same, but for the clock and for what the configuration names.

@@ -6,8 +6,12 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::adapt::fit::ChannelFit;
+use super::alarm::{Alarms, Band, Happening, Reading, Watched};
+use super::beat::BeatEstimate;
 use super::ensemble::{Ensemble, Observation, Parallel, Serial, Snapshot, with_companions};
-pub use super::messages::{ChannelHealth, Disagreement, Estimate, Input, Notice, NoticeKind, Output, WindowDone};
+pub use super::messages::{
+    AlarmsNow, ChannelHealth, Disagreement, Estimate, Input, Notice, NoticeKind, Output, WindowDone,
+};
 use super::settings::{EstimatorSettings, SettingsError};
 use super::signal::quality::{Change, Quality, QualitySettings};
 use super::statistics::Summary;
@@ -21,6 +25,9 @@ pub const REPORT_EVERY_NS: i64 = 10 * NS_PER_S;
 
 /// How long a model must not fit, or fit again, before it is said \[ns\].
 const MISFIT_NS: i64 = NS_PER_S;
+
+/// Time since data from which on an estimate is a forecast, which ends no alarm \[ns\].
+const FORECAST_NS: i64 = NS_PER_S / 2;
 
 /// Time without a shift after which a parameter is said to have begun to move \[ns\].
 const CALM_NS: i64 = 5 * NS_PER_S;
@@ -83,6 +90,7 @@ pub struct Estimator<M: Model> {
     want_members: bool,
     /// Members to go on with.
     members: usize,
+    alarms: Alarms,
     scratch: Scratch,
 }
 
@@ -113,6 +121,7 @@ impl<M: Model> Estimator<M> {
             cutter: WindowCutter::new(settings.window, &settings.channels),
             tallies: settings.channels.iter().map(|_| ChannelTally::new()).collect(),
             tracker: tracker(&settings),
+            alarms: Alarms::new(&settings.live.alarms),
             drawn: (drawn, second.transpose()?),
             second: None,
             told: Vec::new(),
@@ -208,6 +217,7 @@ impl<M: Model> Estimator<M> {
                 // The first are needed first.
                 self.told.truncate(MAX_TOLD);
             }
+            Input::Acknowledge { alarm, author } => self.acknowledge(alarm.as_deref(), &author, out),
         }
         let ended = self.cutter.has_ended();
         loop {
@@ -253,8 +263,55 @@ impl<M: Model> Estimator<M> {
     }
 
     fn put_out_beats(&mut self, last: bool, out: &mut Vec<Output>) {
-        let beats = self.ensemble.iter_mut().flat_map(|ensemble| ensemble.take_beats(last));
-        out.extend(beats.map(Output::Beat));
+        let (time, data) = (self.time(), self.data_behind(self.time()));
+        let Some(ensemble) = &mut self.ensemble else { return };
+        for beat in ensemble.take_beats(last) {
+            self.alarms.look(time, |watched| read_beat(&beat, watched, data));
+            out.push(Output::Beat(beat));
+        }
+        self.put_out_alarms(time, out);
+    }
+
+    /// What stands behind an estimate at a time.
+    fn data_behind(&self, time: EventTime) -> Data {
+        match self.last_observation {
+            // What the settings say of a patient raises no alarm.
+            Some(last) if self.tracker.is_acquired() => {
+                if time.ns_since(last) <= FORECAST_NS {
+                    Data::Behind
+                } else {
+                    Data::Missing
+                }
+            }
+            _ => Data::NotYet,
+        }
+    }
+
+    /// Says what has changed of the alarms, if anything has.
+    fn put_out_alarms(&mut self, time: EventTime, out: &mut Vec<Output>) {
+        if !self.alarms.take_changed() {
+            return;
+        }
+        let alarms = self.alarms.reports();
+        for (i, what) in self.alarms.take_happened() {
+            let (alarm, band) = (&self.settings.live.alarms[i], alarms[i].band);
+            let (kind, text) = match what {
+                Happening::Raised => (NoticeKind::Alarm(i), alarm.raised_text(&self.model, band)),
+                Happening::Over(latched) => (NoticeKind::AlarmOver(i), alarm.over_text(&self.model, band, latched)),
+            };
+            out.push(Output::Notice(Notice { time, kind, channel: None, text: Some(text) }));
+        }
+        out.push(Output::Alarms(AlarmsNow { time, alarms }));
+    }
+
+    fn acknowledge(&mut self, alarm: Option<&str>, author: &str, out: &mut Vec<Output>) {
+        let time = self.time();
+        let by = if author.is_empty() { String::new() } else { format!(" by {author}") };
+        self.alarms.acknowledge(alarm, time, |alarm| {
+            let text = Some(format!("{} acknowledged{by}", alarm.name));
+            out.push(Output::Notice(Notice { time, kind: NoticeKind::AlarmAcknowledged, channel: None, text }));
+        });
+        self.put_out_alarms(time, out);
     }
 
     fn take(&mut self, channel: usize, samples: &[RawSample], now: ArrivalTime, out: &mut Vec<Output>) {
@@ -318,6 +375,8 @@ impl<M: Model> Estimator<M> {
             self.second = self.drawn.1.as_ref().map(|second| second.starting_at(start_s));
             self.ensemble = Some(ensemble);
             out.push(notice(window.start, NoticeKind::Start, None));
+            self.alarms.begin(window.start);
+            self.put_out_alarms(window.start, out);
             self.resize(out);
         }
         out.extend(window.gone_silent.iter().map(|&c| notice(window.end, NoticeKind::Gap, Some(c))));
@@ -496,7 +555,11 @@ impl<M: Model> Estimator<M> {
         let before = if first { window.start.0 - 1 } else { window.start.0 };
         let mut time = EventTime((before.div_euclid(period) + 1) * period);
         while time <= window.end {
-            out.push(Output::Estimate(self.estimate(window, observations, time, parallel)));
+            let estimate = self.estimate(window, observations, time, parallel);
+            let data = self.data_behind(time);
+            self.alarms.look(time, |watched| read_estimate(&estimate, watched, data));
+            out.push(Output::Estimate(estimate));
+            self.put_out_alarms(time, out);
             if self.settings.live.smoothing_lag_ns > 0
                 && let Some(ensemble) = &mut self.ensemble
             {
@@ -555,7 +618,47 @@ fn position(window: &ClosedWindow, time: EventTime) -> f64 {
 }
 
 fn notice(time: EventTime, kind: NoticeKind, channel: Option<usize>) -> Output {
-    Output::Notice(Notice { time, kind, channel })
+    Output::Notice(Notice { time, kind, channel, text: None })
+}
+
+/// Whether data stand behind an estimate.
+#[derive(Debug, Clone, Copy)]
+enum Data {
+    /// There were none so far.
+    NotYet,
+    /// There were none lately: a forecast.
+    Missing,
+    Behind,
+}
+
+impl Data {
+    fn reading(self, summary: Option<&Summary>) -> Reading {
+        match (self, summary) {
+            (Self::NotYet, _) | (_, None) => Reading::Unknown,
+            (Self::Missing, Some(summary)) => Reading::Forecast(Band::from(summary)),
+            (Self::Behind, Some(summary)) => Reading::Measured(Band::from(summary)),
+        }
+    }
+}
+
+/// What an estimate says of what an alarm watches.
+fn read_estimate(estimate: &Estimate, watched: Watched, data: Data) -> Reading {
+    match watched {
+        Watched::Clinical(_) => Reading::Same,
+        Watched::Quantity(q) => data.reading(estimate.quantities.get(q)),
+        Watched::Parameter(parameter) => {
+            let own = estimate.parameters.iter().map(|(p, _)| p).find(|p| p.parameter == parameter);
+            data.reading(own.filter(|p| p.is_identifiable()).map(|p| &p.summary))
+        }
+    }
+}
+
+/// What a beat says of what an alarm watches.
+fn read_beat(beat: &BeatEstimate, watched: Watched, data: Data) -> Reading {
+    match watched {
+        Watched::Clinical(q) => data.reading(beat.values.get(q)),
+        Watched::Quantity(_) | Watched::Parameter(_) => Reading::Same,
+    }
 }
 
 #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]

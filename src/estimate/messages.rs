@@ -1,5 +1,6 @@
 //! What an estimator can be told, and what it says.
 
+use super::alarm::AlarmReport;
 use super::beat::BeatEstimate;
 use super::ensemble::{ParameterSummary, WindowReport};
 use super::signal::quality::Artefact;
@@ -27,6 +28,13 @@ pub enum Input {
     WantMembers(bool),
     /// How many members to go on with, because the machine cannot keep up with more, or can again.
     Members(usize),
+    /// An operator has seen an alarm.
+    Acknowledge {
+        /// Its name; None for all.
+        alarm: Option<String>,
+        /// Who; empty if that is not said.
+        author: String,
+    },
 }
 
 /// What an estimator says.
@@ -42,6 +50,8 @@ pub enum Output {
     Window(WindowDone),
     /// Something happened.
     Notice(Notice),
+    /// An alarm has changed, or the bed begins.
+    Alarms(AlarmsNow),
 }
 
 /// States, derived quantities and parameters at one time.
@@ -59,6 +69,15 @@ pub struct Estimate {
     pub parameters: Vec<(ParameterSummary, i64)>,
     /// `[n_members x (n_states + n_estimated)]` at the end of the window, if wanted.
     pub ensemble: Option<Vec<f64>>,
+}
+
+/// How all alarms stand.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AlarmsNow {
+    /// Event time of the bed.
+    pub time: EventTime,
+    /// One per alarm of the settings, in their order.
+    pub alarms: Vec<AlarmReport>,
 }
 
 /// A solved window.
@@ -83,6 +102,8 @@ pub struct Notice {
     pub kind: NoticeKind,
     /// Index of the channel concerned.
     pub channel: Option<usize>,
+    /// For people, where the kind alone does not say it.
+    pub text: Option<String>,
 }
 
 /// What can happen.
@@ -124,6 +145,12 @@ pub enum NoticeKind {
     BeatMissed,
     /// A beat came at an unexpected time.
     BeatUnexpected,
+    /// An alarm, by its place in the settings, was raised.
+    Alarm(usize),
+    /// The condition of an alarm is over.
+    AlarmOver(usize),
+    /// Somebody has seen an alarm.
+    AlarmAcknowledged,
 }
 
 impl NoticeKind {
@@ -148,6 +175,9 @@ impl NoticeKind {
             Self::BeatFound => "beat_found",
             Self::BeatMissed => "beat_missed",
             Self::BeatUnexpected => "beat_unexpected",
+            Self::Alarm(_) => "alarm",
+            Self::AlarmOver(_) => "alarm_over",
+            Self::AlarmAcknowledged => "alarm_acknowledged",
         }
     }
 
@@ -173,6 +203,9 @@ impl NoticeKind {
             Self::BeatFound => "the beat was found".to_owned(),
             Self::BeatMissed => "no beat came when one was due; the clock waits".to_owned(),
             Self::BeatUnexpected => "a beat came at an unexpected time; the clock was set".to_owned(),
+            Self::Alarm(_) => "an alarm was raised".to_owned(),
+            Self::AlarmOver(_) => "the condition of an alarm is over".to_owned(),
+            Self::AlarmAcknowledged => "an alarm was acknowledged".to_owned(),
         }
     }
 }

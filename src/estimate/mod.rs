@@ -16,6 +16,7 @@
 //! | [`timing`] | the beat from outside or found in the pressures, against the clock of the members |
 //! | [`smoother`] | the members at past times, corrected by what came since |
 //! | [`beat`] | clinical figures per beat |
+//! | [`alarm`] | limits, judged on the bands |
 //! | [`statistics`] | mean, sd by source, quantiles |
 //! | [`messages`] | what an estimator can be told, and what it says |
 //! | [`estimator`] | the state machine that ties these together |
@@ -41,6 +42,7 @@
 //! Deliberately absent: names of topics, wire formats, wall-clock time.
 
 pub mod adapt;
+pub mod alarm;
 pub mod batch;
 pub mod beat;
 pub mod cloud;

@@ -1,6 +1,7 @@
 //! Everything an estimator is told at the start. Plain values in mmHg, mL, s and nanoseconds; where they come from
 //! (files, environment, command line) and whether they make sense together is the business of the edge.
 
+use super::alarm::AlarmSettings;
 use super::time::s_from_ns;
 use super::timing::TimingSource;
 use crate::model::lanes::InstructionSet;
@@ -142,7 +143,7 @@ impl Adaptation {
 }
 
 /// What an estimator does beside its windows.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct LiveSettings {
     /// Where the beat comes from.
     pub timing: TimingSource,
@@ -154,6 +155,8 @@ pub struct LiveSettings {
     pub smoothing_lag_ns: i64,
     /// A filter that runs beside, to compare with.
     pub second_opinion: Option<CouplingKind>,
+    /// Limits that are watched.
+    pub alarms: Vec<AlarmSettings>,
 }
 
 /// Everything else.

@@ -38,6 +38,13 @@ pub enum Task {
     },
     /// Onsets of heart beats.
     Beats(Vec<EventTime>),
+    /// An operator has seen an alarm, by name, or all of them.
+    Acknowledge {
+        /// Its name; None for all.
+        alarm: Option<String>,
+        /// Who; empty if that is not said.
+        author: String,
+    },
     /// Something came that the edge could not make sense of.
     Refused(&'static str),
     /// Time has passed.
@@ -222,6 +229,9 @@ impl Bed {
             }
             Task::Refused(cause) => self.refuse(cause, arrived, out),
             Task::Beats(onsets) => self.drive(Input::Beats(onsets), arrived, parallel, out),
+            Task::Acknowledge { alarm, author } => {
+                self.drive(Input::Acknowledge { alarm, author }, arrived, parallel, out);
+            }
             Task::Tick => self.drive(Input::Tick, arrived, parallel, out),
             Task::Share(share) => {
                 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
@@ -273,6 +283,7 @@ impl Bed {
                 time: self.last_window,
                 kind: NoticeKind::NotUnderstood(cause),
                 channel: None,
+                text: None,
             }));
         }
     }

@@ -264,6 +264,11 @@ impl Service {
                 tracing::warn!(bed = name, cause, "a message for an unknown bed was not understood");
                 return;
             }
+            // A bed appears with its first sample; before that there is nothing to have seen.
+            if let Task::Acknowledge { .. } = task {
+                tracing::warn!(bed = name, "an alarm of an unknown bed was acknowledged");
+                return;
+            }
             if self.beds.len() >= self.limits.max_beds {
                 self.too_many_beds += 1;
                 if self.too_many_beds.is_power_of_two() {

@@ -199,8 +199,8 @@ impl Twin<'_> {
                 let channel = notice.channel.map(|channel| Pressures::NAMES[settings.channels[channel].state]);
                 self.notice(notice.kind.name(), channel, notice.time.as_s());
             }
-            // How windows went is not scored.
-            Output::Window(_) => {}
+            // How windows went is not scored, nor what is made of the estimates.
+            Output::Window(_) | Output::Alarms(_) => {}
         }
     }
 

@@ -16,6 +16,11 @@ use rand_distr::{Distribution, StandardNormal};
 
 const RATE_HZ: i64 = 125;
 
+/// On a quantity, on a figure of a beat and on a parameter.
+const ALARMS: &str = "alarms=[{ name = \"a\", quantity = \"p_a\", above = 300 }, \
+                      { name = \"b\", quantity = \"cardiac_output\", below = 1 }, \
+                      { name = \"c\", quantity = \"r_pv\", above = 1 }]";
+
 /// Drives a bed through some beats; of every handled sample, how much was allocated, and how many windows and messages
 /// came of it.
 fn drive(sets: &[&str]) -> Vec<(i64, u64, usize, usize)> {
@@ -58,6 +63,7 @@ fn windows_allocate_nothing() {
         (vec![three, "window.length_s=0.004"], "coupled, 4 ms"),
         (vec![three, "window.length_s=0.001"], "coupled, 1 ms"),
         (vec![three, "window.length_s=0.004", rate], "coupled, with the heart rate"),
+        (vec![three, "window.length_s=0.004", ALARMS], "coupled, with limits that are kept"),
         (vec![three, "window.length_s=0.004", "estimator.coupling=independent"], "independent"),
     ] {
         let told = drive(&sets);

@@ -213,6 +213,9 @@ fn bad_usage_and_bad_settings_exit_with_2() {
         (vec!["simulate", "--seconds=-1", "--truth", "x.csv"], "above 0"),
         (vec!["simulate"], "--truth"),
         (vec!["watch"], "terminal"),
+        (vec!["note", "--bed", "bed1"], "TEXT"),
+        (vec!["note", "--bed", "bed1", "text", "--time-s", "nan"], "expected seconds"),
+        (vec!["acknowledge"], "--bed"),
         (vec!["validate", "--patient", "helthy"], "expected a TOML file or one of healthy, pulmonary"),
         (vec!["validate", "--patient", "no_such.toml"], "no_such.toml"),
         (vec!["validate", "--scenario", "stepp"], "arterial_line_only"),
@@ -231,7 +234,20 @@ fn bad_usage_and_bad_settings_exit_with_2() {
 
 #[test]
 fn every_command_has_help_with_an_example() {
-    for command in ["demo", "serve", "replay", "watch", "dashboard", "simulate", "estimate", "validate", "config"] {
+    let commands = [
+        "demo",
+        "serve",
+        "replay",
+        "watch",
+        "dashboard",
+        "note",
+        "acknowledge",
+        "simulate",
+        "estimate",
+        "validate",
+        "config",
+    ];
+    for command in commands {
         let output = hemostream(&[command, "--help"]);
         assert!(output.status.success());
         assert!(text(&output.stdout).contains(&format!("hemostream {command}")), "{command}");

@@ -6,8 +6,10 @@ use std::path::{Path, PathBuf};
 use proptest::prelude::*;
 
 use hemostream::edge::config::{
-    Activation, Config, ConfigError, Coupling, Distribution, InitialSd, Origins, Systole, known_keys, render,
+    Activation, AlarmPriority, Config, ConfigError, Coupling, Distribution, InitialSd, Origins, Systole, known_keys,
+    render,
 };
+use hemostream::estimate::alarm::{Limit, Watched};
 use hemostream::model::Model;
 use hemostream::model::cvsim6::{Cvsim6, PARAMETERS, Parameter, Pressures, SystoleRule};
 
@@ -56,6 +58,7 @@ fn presets() -> Vec<PathBuf> {
         "config/paper.toml",
         "config/validate.toml",
         "config/recorded.toml",
+        "config/alarms.toml",
         "config/patients/pulmonary_hypertension.toml",
     ]
     .map(in_repository)
@@ -116,6 +119,23 @@ fn pulmonary_hypertension_doubles_the_resistance() {
 }
 
 #[test]
+fn alarms_are_filled_in_and_listed() {
+    let (config, origins) = load_file(&in_repository("tests/fixtures/config/valid/alarms.toml")).unwrap();
+    let low = &config.alarms[0];
+    assert_eq!((low.below, low.above, low.probability, low.for_s), (Some(4.0), None, 0.95, 10.0));
+    assert_eq!((low.clear_margin, low.clear_for_s, low.priority, low.latched), (0.0, 5.0, AlarmPriority::Medium, true));
+    let told = config.estimator_settings().unwrap().live.alarms;
+    let watched: Vec<Watched> = told.iter().map(|alarm| alarm.watched).collect();
+    // Six pressures and what is lacking are the states.
+    assert_eq!(watched, [Watched::Clinical(2), Watched::Parameter(Parameter::RA as usize), Watched::Quantity(6)]);
+    assert_eq!((told[0].limit, told[1].limit), (Limit::Below(4.0), Limit::Above(2.5)));
+    assert_eq!((told[1].for_ns, told[1].clear_for_ns), (20_000_000_000, 15_000_000_000));
+    let listed = origins.get("alarms").unwrap();
+    assert!(listed.value.contains("\"high resistance\""), "{}", listed.value);
+    assert!(listed.origin.ends_with("alarms.toml"), "{}", listed.origin);
+}
+
+#[test]
 fn valid_fixtures_load() {
     for path in fixtures("valid") {
         let (config, _) = load_file(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
@@ -172,7 +192,7 @@ fn later_layers_win_and_origins_say_so() {
 fn origins_list_every_setting_once_in_the_order_of_the_schema() {
     let (_, origins) = load(&[], &[]).unwrap();
     let keys: Vec<_> = origins.iter().map(|setting| setting.key.as_str()).collect();
-    assert_eq!(keys[..3], ["observed", "discrepancy", "patient.heart_rate"]);
+    assert_eq!(keys[..4], ["observed", "alarms", "discrepancy", "patient.heart_rate"]);
     assert_eq!(keys.last(), Some(&"zenoh.connect"));
     let mut unique = keys.clone();
     unique.sort_unstable();
@@ -359,6 +379,16 @@ fn scripts_are_sorted_and_factors_accumulate() {
 }
 
 #[test]
+fn more_alarms_than_a_bed_has_room_for_are_refused() {
+    let many = |n: usize| {
+        let one = |i: usize| format!("{{ name = \"{i}\", quantity = \"p_a\", below = 60 }}");
+        format!("alarms=[{}]", (0..n).map(one).collect::<Vec<_>>().join(", "))
+    };
+    assert_eq!(load(&[], &[&many(64)]).unwrap().0.alarms.len(), 64);
+    assert_eq!(refusal(&[], &[&many(65)]), "--set: `alarms`: found 65, expected 0 to 64");
+}
+
+#[test]
 fn systole_chooses_the_rule_of_the_model() {
     for (name, rule) in
         [("seconds", SystoleRule::Seconds), ("fraction", SystoleRule::Fraction), ("bazett", SystoleRule::Bazett)]
@@ -385,6 +415,8 @@ fn hash_follows_what_can_change_an_estimate() {
         "patient.systole.fraction=0.33",
         "patient.initial.p_a=90",
         "observed=[\"p_a\"]",
+        "alarms=[{ name = \"a\", quantity = \"p_a\", below = 60 }]",
+        "alarms=[{ name = \"a\", quantity = \"p_a\", below = 61 }]",
     ];
     let mut hashes = changing.map(|set| hash(&[set])).to_vec();
     hashes.push(default);

@@ -124,7 +124,7 @@ impl Bedside {
                 Output::Smoothed(estimate) => self.smoothed.push(estimate),
                 Output::Beat(beat) => self.beats.push(beat),
                 Output::Notice(notice) => self.notices.push(notice),
-                Output::Window(_) => {}
+                Output::Window(_) | Output::Alarms(_) => {}
             }
         }
     }

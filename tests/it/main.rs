@@ -3,7 +3,9 @@
 #![allow(clippy::print_stdout, clippy::print_stderr)]
 #![allow(missing_docs, unreachable_pub)]
 
+mod alarm;
 mod allocations;
+mod bedside_alarms;
 mod cli;
 mod config;
 mod discrepancy;

@@ -52,7 +52,7 @@ fn config(sets: &[&str]) -> Config {
 }
 
 /// A running daemon on a bus of its own, and everything it has said.
-struct Daemon {
+pub(crate) struct Daemon {
     bus: MemoryBus,
     inlet: Inlet,
     outlet: Arc<Outlet>,
@@ -67,7 +67,7 @@ impl Daemon {
     }
 
     /// Hears these topics only.
-    fn start_on(bus: MemoryBus, config: &Config, topics: &[&str]) -> Self {
+    pub(crate) fn start_on(bus: MemoryBus, config: &Config, topics: &[&str]) -> Self {
         let said = Arc::new(Mutex::new(Vec::new()));
         let hear = |topic: &&str| {
             let hearing = Arc::clone(&said);
@@ -91,17 +91,17 @@ impl Daemon {
         Self { bus, inlet, outlet, service, said, subscriptions }
     }
 
-    fn send(&self, message: Message) {
+    pub(crate) fn send(&self, message: Message) {
         self.bus.publish(message, Delivery::Samples).unwrap();
     }
 
     /// The last value under a key, if there is one.
-    fn last(&self, pattern: &str) -> Option<Message> {
+    pub(crate) fn last(&self, pattern: &str) -> Option<Message> {
         self.bus.last_values(pattern, Duration::from_secs(1)).unwrap().pop()
     }
 
     /// Asks for last values until one is as wanted.
-    async fn wait_for(&self, pattern: &str, wanted: impl Fn(&Message) -> bool) -> Message {
+    pub(crate) async fn wait_for(&self, pattern: &str, wanted: impl Fn(&Message) -> bool) -> Message {
         let asked = async {
             loop {
                 if let Some(message) = self.last(pattern).filter(|m| wanted(m)) {
@@ -114,7 +114,7 @@ impl Daemon {
     }
 
     /// Finishes what is waiting; returns all that was said.
-    async fn stop(self) -> Said {
+    pub(crate) async fn stop(self) -> Said {
         self.inlet.stop().await;
         tokio::time::timeout(PATIENCE, self.service).await.expect("the service stops").expect("without a panic");
         assert_eq!(self.inlet.dropped(), 0);
@@ -127,14 +127,14 @@ impl Daemon {
 }
 
 /// Messages in the order of their publication.
-struct Said(Vec<Message>);
+pub(crate) struct Said(Vec<Message>);
 
 impl Said {
-    fn payloads(&self, key: &str) -> Vec<&[u8]> {
+    pub(crate) fn payloads(&self, key: &str) -> Vec<&[u8]> {
         self.0.iter().filter(|m| m.key == key).map(|m| m.payload.as_slice()).collect()
     }
 
-    fn all<T: serde::de::DeserializeOwned>(&self, bed: &str, topic: &str) -> Vec<T> {
+    pub(crate) fn all<T: serde::de::DeserializeOwned>(&self, bed: &str, topic: &str) -> Vec<T> {
         let payloads = self.payloads(&format!("hemostream/{bed}/{topic}"));
         payloads.into_iter().map(|p| wire::decode(p, Encoding::Bincode).unwrap()).collect()
     }
@@ -143,7 +143,7 @@ impl Said {
         self.all(bed, "estimate/state")
     }
 
-    fn events(&self, bed: &str) -> Vec<Event> {
+    pub(crate) fn events(&self, bed: &str) -> Vec<Event> {
         self.all(bed, "event")
     }
 
@@ -155,12 +155,12 @@ impl Said {
         self.all(bed, "status").pop().unwrap_or_else(|| panic!("no status of {bed}"))
     }
 
-    fn counters(&self, bed: &str) -> BTreeMap<String, u64> {
+    pub(crate) fn counters(&self, bed: &str) -> BTreeMap<String, u64> {
         self.last_status(bed).counters.into_iter().collect()
     }
 
     /// Who was heard of.
-    fn beds(&self) -> Vec<&str> {
+    pub(crate) fn beds(&self) -> Vec<&str> {
         let mut beds: Vec<&str> = self.0.iter().filter_map(|m| m.key.split('/').nth(1)).collect();
         beds.sort_unstable();
         beds.dedup();

@@ -237,7 +237,7 @@ impl Observer {
     fn see(&mut self, output: &Output) {
         match output {
             Output::Estimate(estimate) => self.estimate(estimate),
-            Output::Beat(_) | Output::Smoothed(_) => {}
+            Output::Beat(_) | Output::Smoothed(_) | Output::Alarms(_) => {}
             Output::Window(window) => self.window(window),
             Output::Notice(notice) => self.notice(notice),
         }

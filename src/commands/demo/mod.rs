@@ -35,6 +35,15 @@ const SETTINGS: &[&str] = &[
     "estimator.parameter_drift=0.01",
     "estimator.pressure_drift=0.002",
     "estimator.seed=4",
+    // What the embolism brings about; the other two patients stay clear of it.
+    "alarms=[\
+        { name = \"high pulmonary pressure\", quantity = \"p_pa_mean\", above = 25.0, for_s = 5.0, clear_margin = 1.0, \
+          priority = \"high\" }, \
+        { name = \"low arterial mean\", quantity = \"p_a_mean\", below = 65.0, for_s = 10.0, clear_margin = 3.0, \
+          priority = \"high\" }, \
+        { name = \"low output\", quantity = \"cardiac_output\", below = 4.4, for_s = 10.0, clear_margin = 0.2 }, \
+        { name = \"high pulmonary resistance\", quantity = \"r_pv\", above = 0.15, for_s = 5.0, clear_margin = 0.01, \
+          priority = \"low\", latched = false }]",
 ];
 
 /// Blocks as a monitor sends them, and the beds one after the other.

@@ -11,9 +11,10 @@ use super::keys::{self, KeyPath};
 use super::layers::Stack;
 use super::patient::{InitialSd, Patient, ScriptEntry};
 use super::schema::{
-    Config, Coupling, DiscrepancyForm, Distribution, EstimatorSettings, PriorSettings, PublishSettings, SecondOpinion,
-    Timing, WindowSettings,
+    AlarmSettings, Config, Coupling, DiscrepancyForm, Distribution, EstimatorSettings, PriorSettings, PublishSettings,
+    SecondOpinion, Timing, WindowSettings,
 };
+use crate::estimate::alarm::MAX_ALARMS;
 use crate::model::cvsim6::{Cvsim6, PARAMETERS, Pressures};
 use crate::model::{Model, ParameterInfo};
 
@@ -25,6 +26,9 @@ const SHORTEST_S: f64 = 1e-6;
 
 /// Largest seed: TOML has no larger integers.
 const MAX_SEED: u64 = i64::MAX as u64;
+
+/// Longest name of an alarm \[characters\].
+const MAX_ALARM_NAME: usize = 64;
 
 /// Most changes in a script.
 const MAX_SCRIPT: usize = 10_000;
@@ -69,6 +73,7 @@ pub(super) fn faults(config: &Config) -> Vec<Fault> {
         check.variability(&config.patient);
         check.estimator(&config.estimator);
         check.discrepancy(config);
+        check.alarms(config);
         check.window(&config.window);
         check.channels(config);
         check.publish(&config.publish);
@@ -302,6 +307,52 @@ impl Checker {
             self.number(key.join("magnitude"), number(settings.magnitude), &positive_to(limit), &unit);
             self.number(key.join("inertance"), settings.inertance.unwrap_or(1.0), &positive_to(1e6), " s");
             self.number(key.join("initial_sd"), settings.initial_sd.unwrap_or(0.0), &(0.0..=limit), &unit);
+        }
+    }
+
+    fn alarms(&mut self, config: &Config) {
+        self.whole("alarms", config.alarms.len(), 0..=MAX_ALARMS);
+        for (position, alarm) in config.alarms.iter().enumerate() {
+            let key = format!("alarms.{position}");
+            let longest = alarm.name.chars().count() > MAX_ALARM_NAME;
+            if alarm.name.trim().is_empty() || longest || alarm.name.chars().any(char::is_control) {
+                let expected = format!("expected text of 1 to {MAX_ALARM_NAME} characters on one line");
+                self.refuse(format!("{key}.name"), format!("found {:?}, {expected}", alarm.name));
+            }
+            if config.alarms[..position].iter().any(|other| other.name == alarm.name) {
+                let message = format!("found \"{}\" more than once, expected each name once", alarm.name);
+                self.refuse(format!("{key}.name"), message);
+            }
+            self.watched(&format!("{key}.quantity"), &alarm.quantity, config);
+            self.alarm(&key, alarm);
+        }
+    }
+
+    fn alarm(&mut self, key: &str, alarm: &AlarmSettings) {
+        if alarm.below.is_some() == alarm.above.is_some() {
+            let found = if alarm.below.is_some() { "both" } else { "neither" };
+            self.refuse(key, format!("found {found}, expected exactly one of `below` and `above`"));
+        }
+        // Beyond that, members cannot tell; below a half, it would be more likely than not that nothing is the matter.
+        self.number(format!("{key}.probability"), alarm.probability, &(0.5..=0.999), "");
+        self.number(format!("{key}.for_s"), alarm.for_s, &(0.0..=3600.0), " s");
+        self.number(format!("{key}.clear_margin"), alarm.clear_margin, &(0.0..=1e6), "");
+        self.number(format!("{key}.clear_for_s"), alarm.clear_for_s, &(0.0..=3600.0), " s");
+    }
+
+    /// What an alarm watches must be known and estimated.
+    fn watched(&mut self, key: &str, name: &str, config: &Config) {
+        let model = config.patient.model();
+        let quantities = model.states().iter().chain(model.derived()).chain(model.clinical()).map(|q| q.name);
+        let lacking = config.discrepancy.keys().map(|name| format!("delta_{name}")).collect::<Vec<_>>();
+        let estimated = config.estimator.estimate.iter().chain(&lacking).map(String::as_str);
+        let known: Vec<&str> = quantities.chain(estimated).collect();
+        if parameter(name).is_some() && !known.contains(&name) {
+            let expected = "expected a parameter of `estimator.estimate` or another quantity";
+            let message = format!("found \"{name}\", which is not estimated, {expected}");
+            self.refuse_against(key, "estimator.estimate", message);
+        } else {
+            self.name(key, name, &known);
         }
     }
 

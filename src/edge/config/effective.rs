@@ -60,7 +60,7 @@ impl Origins {
 }
 
 impl Config {
-    /// A hash of all settings that can change an estimate: everything except `[zenoh]`, `[service]` and
+    /// A hash of all settings that can change an estimate or an alarm: everything except `[zenoh]`, `[service]` and
     /// `publish.prefix`. The same on every machine and in every run.
     #[must_use]
     pub fn hash(&self) -> u64 {

@@ -30,9 +30,9 @@ pub use error::{ConfigError, Problem};
 pub use keys::known_keys;
 pub use patient::{InitialSd, Patient, PulmonaryLaw, ScriptEntry, Systole};
 pub use schema::{
-    Activation, ChannelSettings, Config, Coupling, DiscrepancyForm, DiscrepancySettings, Distribution,
-    EstimatorSettings, Nodes, PerState, PriorSettings, PublishSettings, SecondOpinion, ServiceSettings, Timing,
-    WindowSettings, ZenohMode, ZenohSettings,
+    Activation, AlarmPriority, AlarmSettings, ChannelSettings, Config, Coupling, DiscrepancyForm, DiscrepancySettings,
+    Distribution, EstimatorSettings, Nodes, PerState, PriorSettings, PublishSettings, SecondOpinion, ServiceSettings,
+    Timing, WindowSettings, ZenohMode, ZenohSettings,
 };
 
 impl Config {

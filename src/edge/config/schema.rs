@@ -19,6 +19,8 @@ use crate::model::lanes::InstructionSet;
 pub struct Config {
     /// Names of the states whose sensors are believed; other channels are received and ignored.
     pub observed: Vec<String>,
+    /// Limits that are watched.
+    pub alarms: Vec<AlarmSettings>,
     /// What the equations may lack, by flow (`q_pv`) or by state, for its balance (`p_a`).
     pub discrepancy: BTreeMap<String, DiscrepancySettings>,
     /// The patient: parameters of the model, start, script.
@@ -219,6 +221,70 @@ pub enum DiscrepancyForm {
     Tracked,
 }
 
+/// `[[alarms]]`; below or above, and what is left out is the default.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AlarmSettings {
+    /// What people call it.
+    pub name: String,
+    /// Quantity, clinical quantity of a beat, or estimated parameter.
+    pub quantity: String,
+    /// It is raised below this, in the unit of the quantity.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub below: Option<f64>,
+    /// It is raised above this.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub above: Option<f64>,
+    /// Probability of being beyond the limit from which on it counts.
+    #[serde(default = "AlarmSettings::default_probability")]
+    pub probability: f64,
+    /// How long it must be before it is raised \[s\].
+    #[serde(default = "AlarmSettings::default_for_s")]
+    pub for_s: f64,
+    /// How far back beyond the limit it must be to be over, in the unit of the quantity.
+    #[serde(default)]
+    pub clear_margin: f64,
+    /// How long it must be back \[s\].
+    #[serde(default = "AlarmSettings::default_clear_for_s")]
+    pub clear_for_s: f64,
+    /// How urgent it is.
+    #[serde(default, deserialize_with = "by_name")]
+    pub priority: AlarmPriority,
+    /// Whether it stays until somebody acknowledges it.
+    #[serde(default = "AlarmSettings::default_latched")]
+    pub latched: bool,
+}
+
+// Entries of a list have no layer below them.
+impl AlarmSettings {
+    fn default_probability() -> f64 {
+        0.95
+    }
+
+    fn default_for_s() -> f64 {
+        10.0
+    }
+
+    fn default_clear_for_s() -> f64 {
+        5.0
+    }
+
+    fn default_latched() -> bool {
+        true
+    }
+}
+
+/// How urgent an alarm is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[expect(missing_docs, reason = "the names are the documentation")]
+pub enum AlarmPriority {
+    Low,
+    #[default]
+    Medium,
+    High,
+}
+
 /// `[window]`
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -403,6 +469,7 @@ impl Default for Config {
         ];
         Self {
             observed: Pressures::NAMES.iter().map(|&name| name.to_owned()).collect(),
+            alarms: Vec::new(),
             patient: Patient::default(),
             estimator: EstimatorSettings::default(),
             discrepancy: BTreeMap::new(),
