@@ -37,10 +37,10 @@ pub(crate) struct Dashboard {
 impl Dashboard {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
-        log_to_stderr("hemostream=info,warn");
+        log_to_stderr("hemostream=info,warn")?;
         let settings = client_settings(&config, &self.connect);
         tokio_runtime()?.block_on(async {
-            let listener = bind(&self.listen).await?;
+            let listener = bind("--listen", &self.listen).await?;
             let link = Link::default();
             let web = Web::start(listener, &config.publish.prefix, Topics::All, link.connect(settings.clone()))
                 .map_err(super::failed)?;
@@ -58,10 +58,10 @@ impl Dashboard {
 }
 
 /// A listener at an address that a user gave.
-pub(crate) async fn bind(address: &str) -> Result<TcpListener, Failure> {
+pub(crate) async fn bind(option: &str, address: &str) -> Result<TcpListener, Failure> {
     TcpListener::bind(address).await.map_err(|error| {
         let hint = "expected ADDRESS:PORT with a port that is free, for example 127.0.0.1:8787";
-        Failure::Input(format!("--listen {address}: {error}; {hint}"))
+        Failure::Input(format!("{option} {address}: {error}; {hint}"))
     })
 }
 

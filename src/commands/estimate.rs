@@ -55,7 +55,7 @@ pub(crate) fn whole(value: f64) -> u64 {
 impl Estimate {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
-        log_to_stderr("hemostream=warn,warn");
+        log_to_stderr("hemostream=warn,warn")?;
         let known = |e: &str| e.eq_ignore_ascii_case("csv");
         for output in [Some(&self.output), self.beats.as_ref(), self.events.as_ref()].into_iter().flatten() {
             if !output.extension().and_then(|e| e.to_str()).is_some_and(known) {

@@ -131,10 +131,20 @@ pub(crate) fn progress_bar(length: u64, template: &str) -> ProgressBar {
     bar
 }
 
-fn log_to_stderr(default: &str) {
+/// Starts the log: what is written says `HEMOSTREAM_LOG`, how says `HEMOSTREAM_LOG_FORMAT` (text or json).
+fn log_to_stderr(default: &str) -> Result<(), Failure> {
     let filter = tracing_subscriber::EnvFilter::try_from_env("HEMOSTREAM_LOG")
         .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new(default));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).init();
+    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match std::env::var("HEMOSTREAM_LOG_FORMAT").as_deref() {
+        Err(_) | Ok("" | "text") => log.with_ansi(std::io::stderr().is_terminal()).init(),
+        // One object per line, the fields at its top: what collectors of logs read.
+        Ok("json") => log.json().flatten_event(true).init(),
+        Ok(other) => {
+            return Err(Failure::Input(format!("HEMOSTREAM_LOG_FORMAT: found \"{other}\", expected text or json")));
+        }
+    }
+    Ok(())
 }
 
 pub(crate) fn main() -> ExitCode {

@@ -67,7 +67,7 @@ pub(crate) fn client_settings(config: &Config, connect: &[String]) -> ZenohSetti
 impl Replay {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
-        log_to_stderr("hemostream=info,warn");
+        log_to_stderr("hemostream=info,warn")?;
         let mut beds = self.make_beds(&config)?;
         let options = ReplayOptions {
             rate_hz: self.rate_hz,

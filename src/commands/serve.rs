@@ -6,6 +6,7 @@ use std::time::Duration;
 use clap::Args;
 use hemostream::edge::bus::Bus;
 use hemostream::edge::config::Config;
+use hemostream::edge::dashboard::web::{Topics, Web};
 use hemostream::edge::zenoh::ZenohBus;
 use hemostream::edge::{inlet, outlet::Outlet};
 use hemostream::runtime::bed::Account;
@@ -13,6 +14,7 @@ use hemostream::runtime::clock::Clock;
 use hemostream::runtime::service::{Inlet, Limits, Service};
 use hemostream::runtime::workers::Workers;
 
+use super::dashboard::bind;
 use super::{ConfigArgs, Failure, failed, log_to_stderr, say};
 
 /// Run the daemon: estimate every bed whose pressures arrive
@@ -22,6 +24,9 @@ use super::{ConfigArgs, Failure, failed, log_to_stderr, say};
 pub(crate) struct Serve {
     #[command(flatten)]
     config: ConfigArgs,
+    /// Serve /metrics (Prometheus), /healthz and /readyz at this address and port
+    #[arg(long, value_name = "ADDRESS")]
+    metrics: Option<String>,
 }
 
 /// A running daemon within this process.
@@ -114,10 +119,14 @@ pub(crate) async fn asked_to_stop() {
 impl Serve {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
-        log_to_stderr("hemostream=info,warn");
+        log_to_stderr("hemostream=info,warn")?;
         tokio_runtime()?.block_on(async {
             let bus = ZenohBus::open(&config.zenoh)?;
             let running = Running::start(Arc::new(bus.clone()), &config)?;
+            let metrics = match &self.metrics {
+                Some(address) => Some(observe(address, &config, &bus).await?),
+                None => None,
+            };
             say(format!(
                 "hemostream serves {}/*/pressure/* at {} (config {:016x}); Ctrl-C stops",
                 config.publish.prefix,
@@ -126,8 +135,21 @@ impl Serve {
             ));
             asked_to_stop().await;
             running.stop().await;
+            if let Some(metrics) = metrics {
+                metrics.stop().await;
+            }
             bus.close();
             Ok(())
         })
     }
+}
+
+/// Metrics and health of this daemon, as its own messages tell them.
+async fn observe(address: &str, config: &Config, bus: &ZenohBus) -> Result<Web, Failure> {
+    let listener = bind("--metrics", address).await?;
+    let bus: Arc<dyn Bus> = Arc::new(bus.clone());
+    let web = Web::start(listener, &config.publish.prefix, Topics::Health, Box::new(move || Ok(Arc::clone(&bus))));
+    let web = web.map_err(failed)?;
+    say(format!("metrics at http://{}/metrics", web.address()));
+    Ok(web)
 }

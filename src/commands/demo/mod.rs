@@ -116,10 +116,10 @@ impl Demo {
     /// The address asked for; without one a port of its own if the usual one is taken.
     async fn listener(&self) -> Result<tokio::net::TcpListener, Failure> {
         match &self.listen {
-            Some(address) => bind(address).await,
-            None => match bind(ADDRESS).await {
+            Some(address) => bind("--listen", address).await,
+            None => match bind("--listen", ADDRESS).await {
                 Ok(listener) => Ok(listener),
-                Err(_) => bind("127.0.0.1:0").await,
+                Err(_) => bind("--listen", "127.0.0.1:0").await,
             },
         }
     }

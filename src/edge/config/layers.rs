@@ -22,7 +22,7 @@ use super::schema::Config;
 pub(super) const PREFIX: &str = "HEMOSTREAM_";
 
 /// Variables with our prefix that are not settings: the filter of the log.
-const OTHER_VARIABLES: &[&str] = &["HEMOSTREAM_LOG"];
+const OTHER_VARIABLES: &[&str] = &["HEMOSTREAM_LOG", "HEMOSTREAM_LOG_FORMAT"];
 
 /// Ranks of the layers over the defaults; every `--set` has one of its own above them.
 const PRESET_RANK: usize = 1;

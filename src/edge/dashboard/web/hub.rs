@@ -59,6 +59,11 @@ impl Hub {
         self.bus.get()
     }
 
+    /// Whether the bus is reached at all.
+    pub(super) fn has_bus(&self) -> bool {
+        self.bus().is_some()
+    }
+
     /// Whether there is a link to somebody on the bus.
     pub(super) fn is_connected(&self) -> bool {
         self.bus().is_some_and(|bus| bus.is_connected())

@@ -64,8 +64,9 @@ impl Web {
         let hub = Arc::new(Hub::new(prefix));
         let address = listener.local_addr()?;
         let router = match topics {
-            Topics::All => page_routes().merge(health_routes()),
-            Topics::Health => health_routes(),
+            // A dashboard is of use while it has a link to the daemon; the daemon itself needs nobody.
+            Topics::All => page_routes().merge(health_routes(Hub::is_connected)),
+            Topics::Health => health_routes(Hub::has_bus),
         };
         let feeding = Arc::clone(&hub);
         let feed =
@@ -104,7 +105,14 @@ fn page_routes() -> Router<Arc<Hub>> {
     router
 }
 
-fn health_routes() -> Router<Arc<Hub>> {
+fn health_routes(is_ready: fn(&Hub) -> bool) -> Router<Arc<Hub>> {
+    let ready = async move |State(hub): State<Arc<Hub>>| {
+        if is_ready(&hub) {
+            "ready\n".into_response()
+        } else {
+            (StatusCode::SERVICE_UNAVAILABLE, "no link to the daemon\n").into_response()
+        }
+    };
     Router::new()
         .route("/metrics", get(metrics))
         .route("/healthz", get(|| async { "ok\n" }))
@@ -133,15 +141,6 @@ async fn metrics(State(hub): State<Arc<Hub>>) -> Response {
     match hub.with_ward(|ward| metrics::text(ward, now, own)) {
         Ok(text) => ([(header::CONTENT_TYPE, metrics::CONTENT_TYPE)], text).into_response(),
         Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, error.to_string()).into_response(),
-    }
-}
-
-/// Ready is who has a link to the daemon.
-async fn ready(State(hub): State<Arc<Hub>>) -> Response {
-    if hub.is_connected() {
-        "ready\n".into_response()
-    } else {
-        (StatusCode::SERVICE_UNAVAILABLE, "no link to the daemon\n").into_response()
     }
 }
 
