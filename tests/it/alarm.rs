@@ -81,7 +81,7 @@ fn it_is_raised_after_the_delay_and_not_before() {
     assert_eq!(bed.happened, [Happening::Raised]);
     let report = bed.report();
     assert_eq!((report.since, report.acknowledged), (EventTime::from_s(15.0), false));
-    assert_eq!(report.band, at(3.2));
+    assert_eq!(Measured(report.band), LOW);
 }
 
 #[test]
