@@ -1,8 +1,10 @@
 //! The commands: arguments, exit codes, and what is printed. The work is done by the library.
 
 mod config;
+mod convert;
 mod demo;
 mod estimate;
+mod record;
 mod replay;
 mod reproduce;
 mod serve;
@@ -37,9 +39,11 @@ enum Command {
     Demo(demo::Demo),
     Serve(serve::Serve),
     Replay(replay::Replay),
+    Record(record::Record),
     Watch(watch::Watch),
     Simulate(simulate::Simulate),
     Estimate(estimate::Estimate),
+    Convert(convert::Convert),
     Validate(validate::Validate),
     Reproduce(reproduce::Reproduce),
     Config(config::ConfigCommand),
@@ -129,9 +133,11 @@ pub(crate) fn main() -> ExitCode {
         Command::Demo(command) => command.run(),
         Command::Serve(command) => command.run(),
         Command::Replay(command) => command.run(),
+        Command::Record(command) => command.run(),
         Command::Watch(command) => command.run(),
         Command::Simulate(command) => command.run(),
         Command::Estimate(command) => command.run(),
+        Command::Convert(command) => command.run(),
         Command::Validate(command) => command.run(),
         Command::Reproduce(command) => command.run(),
         Command::Config(command) => command.run(),

@@ -10,6 +10,7 @@ pub mod dashboard;
 pub mod files;
 pub mod inlet;
 pub mod outlet;
+pub mod recording;
 pub mod replay;
 pub mod scoreboard;
 pub mod settings;
