@@ -190,23 +190,24 @@ impl Recorder {
         message: &Message,
         arrival: i64,
     ) -> Result<Result<(), tables::Refused>, FileError> {
-        let Some(folder) = layout::escape(bed) else { return Ok(Err("bed_name")) };
-        if !self.beds.contains_key(bed) && self.beds.len() >= self.options.max_beds {
+        let known = self.beds.contains_key(bed);
+        if !known && self.beds.len() >= self.options.max_beds {
             return Ok(Err("too_many_beds"));
         }
-        // A bed is one as soon as something of it was understood.
-        let mut memory = self.beds.remove(bed);
-        let entry = tables::entry(topic, message, arrival, memory.get_or_insert_default());
-        let entry = match entry {
-            Ok(entry) => entry,
-            Err(cause) => {
-                if let Some(memory) = memory.filter(|_| self.buffers.keys().any(|(b, _)| b == bed)) {
-                    self.beds.insert(bed.to_owned(), memory);
-                }
-                return Ok(Err(cause));
-            }
+        let memory = self.beds.entry(bed.to_owned()).or_default();
+        let outcome = match tables::entry(topic, message, arrival, memory) {
+            Ok(entry) => self.add_entry(bed, entry, arrival)?,
+            Err(cause) => Err(cause),
         };
-        self.beds.extend(memory.map(|memory| (bed.to_owned(), memory)));
+        // What nobody understands makes no bed.
+        if outcome.is_err() && !known {
+            self.beds.remove(bed);
+        }
+        Ok(outcome)
+    }
+
+    fn add_entry(&mut self, bed: &str, entry: Entry, arrival: i64) -> Result<Result<(), tables::Refused>, FileError> {
+        let Some(folder) = layout::escape(bed) else { return Ok(Err("bed_name")) };
         if entry.rows.is_empty() {
             return Ok(Ok(()));
         }
