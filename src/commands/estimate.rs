@@ -4,8 +4,10 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use hemostream::edge::config::{Config, Timing};
-use hemostream::edge::files::csv::{EventWriter, TableWriter, beat_header, beat_row, estimate_header, estimate_row};
+use hemostream::edge::files::csv::{beat_header, beat_row, estimate_header, estimate_row};
 use hemostream::edge::files::record::Record;
+use hemostream::edge::files::table::{EventTable, Table, TableFormat};
+use hemostream::edge::files::units::Units;
 use hemostream::edge::outlet::notice_text;
 use hemostream::estimate::estimator::{Input, Output};
 use hemostream::estimate::time::ArrivalTime;
@@ -23,7 +25,8 @@ use super::{ConfigArgs, Failure, failed, log_to_stderr, progress_bar, say};
 #[derive(Args)]
 #[command(after_help = "Example:  hemostream estimate observed.csv --config config/paper.toml --output out.csv")]
 pub(crate) struct Estimate {
-    /// Record: CSV with `time_s` and any of the six pressures, by name or monitor label, or the header of a WFDB record
+    /// Record: CSV or Parquet with `time_s` and any of the six pressures, by name or monitor label, or the header of a
+    /// WFDB record
     #[arg(value_name = "INPUT", required_unless_present = "record", conflicts_with = "record")]
     input: Option<PathBuf>,
     /// The same by name
@@ -31,14 +34,14 @@ pub(crate) struct Estimate {
     record: Option<PathBuf>,
     #[command(flatten)]
     config: ConfigArgs,
-    /// Where to write the estimates (CSV)
+    /// Where to write the estimates (CSV or Parquet, by the ending)
     #[arg(long, value_name = "FILE")]
     output: PathBuf,
-    /// Where to write what is read off each heart beat (CSV): stroke volume, cardiac output, resistances, pressures
+    /// Where to write what is read off each heart beat (likewise): stroke volume, cardiac output, resistances, pressures
     #[arg(long, value_name = "FILE")]
     beats: Option<PathBuf>,
-    /// Where to write what happened (CSV): alarms, artefacts, beats missed, parameters that moved, a model that
-    /// does not fit
+    /// Where to write what happened (likewise): alarms, artefacts, beats missed, parameters that moved, a model that does
+    /// not fit
     #[arg(long, value_name = "FILE")]
     events: Option<PathBuf>,
     /// Worker threads, over the configuration; 0 is one per core
@@ -56,12 +59,8 @@ impl Estimate {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
         log_to_stderr("hemostream=warn,warn")?;
-        let known = |e: &str| e.eq_ignore_ascii_case("csv");
         for output in [Some(&self.output), self.beats.as_ref(), self.events.as_ref()].into_iter().flatten() {
-            if !output.extension().and_then(|e| e.to_str()).is_some_and(known) {
-                let message = format!("{}: found another ending, expected .csv", output.display());
-                return Err(Failure::Input(message));
-            }
+            TableFormat::of(output)?;
         }
         let Some(input) = self.record.as_ref().or(self.input.as_ref()) else {
             return Err(Failure::Input("found no record, expected INPUT or --record".to_owned()));
@@ -99,9 +98,9 @@ struct Run {
     bed: Offline,
     /// Channel of each column, where it is listened to.
     channels: Vec<Option<usize>>,
-    table: TableWriter,
-    beats: Option<TableWriter>,
-    events: Option<EventWriter>,
+    table: Table,
+    beats: Option<Table>,
+    events: Option<EventTable>,
     /// Whether the table holds what is known after the smoothing lag.
     smoothed: bool,
     outputs: Vec<Output>,
@@ -131,10 +130,12 @@ impl Run {
             return Err(Failure::Input(format!("no column of the record is observed, expected one of {expected}")));
         }
         let progress = progress_bar(whole(seconds), "{bar:40} {pos}/{len} s  {eta} left");
+        let units = Units::of_model(&model);
+        let create = |path: &Path, header: &[String]| Table::create(path, header, &units);
         Ok(Self {
-            table: TableWriter::create(&args.output, &estimate_header(&model, estimator.estimated()))?,
-            events: args.events.as_deref().map(EventWriter::create).transpose()?,
-            beats: args.beats.as_deref().map(|path| TableWriter::create(path, &beat_header(&model))).transpose()?,
+            table: create(&args.output, &estimate_header(&model, estimator.estimated()))?,
+            events: args.events.as_deref().map(EventTable::create).transpose()?,
+            beats: args.beats.as_deref().map(|path| create(path, &beat_header(&model))).transpose()?,
             smoothed: config.estimator.smoothing_lag_s > 0.0,
             bed,
             channels,

@@ -2,10 +2,12 @@
 
 mod acknowledge;
 mod config;
+mod convert;
 mod dashboard;
 mod demo;
 mod estimate;
 mod note;
+mod record;
 mod replay;
 mod reproduce;
 mod serve;
@@ -41,12 +43,14 @@ enum Command {
     Demo(demo::Demo),
     Serve(serve::Serve),
     Replay(replay::Replay),
+    Record(record::Record),
     Watch(watch::Watch),
     Dashboard(dashboard::Dashboard),
     Acknowledge(acknowledge::Acknowledge),
     Note(note::Note),
     Simulate(simulate::Simulate),
     Estimate(estimate::Estimate),
+    Convert(convert::Convert),
     Validate(validate::Validate),
     Reproduce(reproduce::Reproduce),
     Config(config::ConfigCommand),
@@ -152,12 +156,14 @@ pub(crate) fn main() -> ExitCode {
         Command::Demo(command) => command.run(),
         Command::Serve(command) => command.run(),
         Command::Replay(command) => command.run(),
+        Command::Record(command) => command.run(),
         Command::Watch(command) => command.run(),
         Command::Dashboard(command) => command.run(),
         Command::Acknowledge(command) => command.run(),
         Command::Note(command) => command.run(),
         Command::Simulate(command) => command.run(),
         Command::Estimate(command) => command.run(),
+        Command::Convert(command) => command.run(),
         Command::Validate(command) => command.run(),
         Command::Reproduce(command) => command.run(),
         Command::Config(command) => command.run(),

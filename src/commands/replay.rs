@@ -6,28 +6,35 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use hemostream::edge::config::{Config, ZenohMode, ZenohSettings};
-use hemostream::edge::replay::{Bed, ReplayOptions, Source, run, wait_for_listener};
+use hemostream::edge::recording::playback::{Playback, play};
+use hemostream::edge::replay::{Bed, ReplayOptions, Source, run, wait_for_listener, wait_for_listener_at};
 use hemostream::edge::zenoh::ZenohBus;
 
 use super::serve::{asked_to_stop, tokio_runtime};
 use super::simulate::{not_negative, positive};
-use super::{ConfigArgs, Failure, log_to_stderr, say};
+use super::{ConfigArgs, Failure, log_to_stderr, progress_bar, say};
 
-/// Publish a patient, synthetic or recorded, at its own pace
+/// Publish a patient, synthetic or recorded, or a whole recording, at its own pace
 #[derive(Args)]
 #[command(
     after_help = "Examples:  hemostream replay --config config/patients/pulmonary_hypertension.toml\n           \
-                        hemostream replay --record observed.csv --speed 4 --bed icu-7"
+                        hemostream replay --record observed.csv --speed 4 --bed icu-7\n           \
+                        hemostream replay --recording recording --speed 10"
 )]
 pub(crate) struct Replay {
     #[command(flatten)]
     config: ConfigArgs,
-    /// Replay this record (CSV) instead of the synthetic patient of the configuration
+    /// Replay this record (CSV, Parquet, WFDB) instead of the synthetic patient of the configuration
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
-    /// Name of the bed; several beds are called NAME-1, NAME-2, ...
-    #[arg(long, default_value = "bed1")]
-    bed: String,
+    /// Play back what `hemostream record` wrote here: all beds, with the times between messages that they arrived with
+    #[arg(long, value_name = "DIR",
+          conflicts_with_all = ["record", "beds", "rate_hz", "block_s", "stagger_s", "start_s"])]
+    recording: Option<PathBuf>,
+    /// Name of the bed [default: bed1]; several beds are called NAME-1, NAME-2, ... Of a recording: a bed to play, may
+    /// be repeated
+    #[arg(long, value_name = "NAME")]
+    bed: Vec<String>,
     /// Number of beds; synthetic ones differ in their noise
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=1000))]
     beds: u32,
@@ -64,11 +71,60 @@ pub(crate) fn client_settings(config: &Config, connect: &[String]) -> ZenohSetti
     ZenohSettings { mode: ZenohMode::Client, listen: Vec::new(), connect }
 }
 
+/// A way to the daemon.
+struct Connected {
+    bus: ZenohBus,
+    stop: Arc<AtomicBool>,
+    /// Where it is.
+    to: String,
+    _runtime: tokio::runtime::Runtime,
+}
+
 impl Replay {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
         log_to_stderr("hemostream=info,warn")?;
-        let mut beds = self.make_beds(&config)?;
+        match &self.recording {
+            Some(directory) => self.play(&config, Playback::open(directory, &self.bed, &config.publish.prefix)?),
+            None => self.publish(&config),
+        }
+    }
+
+    /// A bus, and what is set when it is time to stop.
+    fn connect(&self, config: &Config) -> Result<Connected, Failure> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let runtime = tokio_runtime()?;
+        let stopping = Arc::clone(&stop);
+        runtime.spawn(async move {
+            asked_to_stop().await;
+            stopping.store(true, Ordering::Relaxed);
+        });
+        let settings = client_settings(config, &self.connect);
+        let bus = runtime.block_on(async { ZenohBus::open(&settings) })?;
+        Ok(Connected { bus, stop, to: settings.connect.join(", "), _runtime: runtime })
+    }
+
+    fn play(&self, config: &Config, mut playback: Playback) -> Result<(), Failure> {
+        let Connected { bus, stop, to, _runtime } = self.connect(config)?;
+        let beds = playback.beds().join(", ");
+        say(format!("playing {beds} under {}/ to {to}", config.publish.prefix));
+        if !playback.first_key().is_some_and(|key| wait_for_listener_at(&bus, key, &stop)) {
+            say("nobody listens yet; publishing all the same");
+        }
+        let bar = progress_bar(0, "{elapsed}  {pos} messages  {msg}");
+        let played = play(&bus, &mut playback, self.speed, self.seconds, &stop, &mut |played| {
+            bar.set_position(played.messages);
+            bar.set_message(format!("{:.0} s of the recording", played.seconds));
+        });
+        bar.finish_and_clear();
+        bus.close();
+        let played = played?;
+        say(format!("published {} messages of {:.1} recorded seconds", played.messages, played.seconds));
+        Ok(())
+    }
+
+    fn publish(&self, config: &Config) -> Result<(), Failure> {
+        let mut beds = self.make_beds(config)?;
         let options = ReplayOptions {
             rate_hz: self.rate_hz,
             speed: self.speed,
@@ -79,34 +135,26 @@ impl Replay {
             repeat: self.repeat,
             ..ReplayOptions::default()
         };
-        let stop = Arc::new(AtomicBool::new(false));
-        let runtime = tokio_runtime()?;
-        let stopping = Arc::clone(&stop);
-        runtime.spawn(async move {
-            asked_to_stop().await;
-            stopping.store(true, Ordering::Relaxed);
-        });
-        let settings = client_settings(&config, &self.connect);
-        let bus = runtime.block_on(async { ZenohBus::open(&settings) })?;
-        say(format!(
-            "publishing {} bed(s) under {}/ to {}",
-            self.beds,
-            config.publish.prefix,
-            settings.connect.join(", ")
-        ));
-        if !beds.first().is_some_and(|bed| wait_for_listener(&bus, &config, bed.name(), &stop)) {
+        let Connected { bus, stop, to, _runtime } = self.connect(config)?;
+        say(format!("publishing {} bed(s) under {}/ to {}", self.beds, config.publish.prefix, to));
+        if !beds.first().is_some_and(|bed| wait_for_listener(&bus, config, bed.name(), &stop)) {
             say("nobody listens yet; publishing all the same");
         }
-        let seconds = run(&bus, &config, &options, &mut beds, &stop)?;
+        let seconds = run(&bus, config, &options, &mut beds, &stop)?;
         bus.close();
         say(format!("published {seconds:.1} patient-seconds"));
         Ok(())
     }
 
     fn make_beds(&self, config: &Config) -> Result<Vec<Bed>, Failure> {
+        let bed = match self.bed.as_slice() {
+            [] => "bed1",
+            [bed] => bed.as_str(),
+            _ => return Err(Failure::Input("--bed: found several, expected one, or --recording".to_owned())),
+        };
         let mut beds = Vec::new();
         for i in 0..self.beds {
-            let name = if self.beds == 1 { self.bed.clone() } else { format!("{}-{}", self.bed, i + 1) };
+            let name = if self.beds == 1 { bed.to_owned() } else { format!("{bed}-{}", i + 1) };
             let source = match &self.record {
                 Some(path) => Source::record(path, config)?,
                 None => Source::synthetic(config, config.estimator.seed.wrapping_add(u64::from(i)))?,

@@ -3,7 +3,9 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use hemostream::edge::files::csv::{TableWriter, truth_header};
+use hemostream::edge::files::csv::truth_header;
+use hemostream::edge::files::table::{Table, TableFormat};
+use hemostream::edge::files::units::Units;
 use hemostream::edge::synthetic::SyntheticPatient;
 use hemostream::model::cvsim6::Pressures;
 
@@ -27,10 +29,11 @@ pub(crate) struct Simulate {
     /// Seed of sensor noise and wandering parameters; the estimator's if left out
     #[arg(long)]
     seed: Option<u64>,
-    /// Where to write the truth: pressures, flows, volumes, changing parameters
+    /// Where to write the truth: pressures, flows, volumes, changing parameters (CSV or Parquet, by the
+    /// ending)
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// Where to write the observed pressures with noise
+    /// Where to write the observed pressures with noise (likewise)
     #[arg(long, value_name = "FILE")]
     observed: Option<PathBuf>,
 }
@@ -52,13 +55,17 @@ impl Simulate {
         if self.truth.is_none() && self.observed.is_none() {
             return Err(Failure::Input("nothing to write: give --truth FILE, --observed FILE or both".to_owned()));
         }
+        for output in [&self.truth, &self.observed].into_iter().flatten() {
+            TableFormat::of(output)?;
+        }
         let (config, _) = self.config.load()?;
         let mut patient = SyntheticPatient::new(&config, self.seed.unwrap_or(config.estimator.seed))?;
         let changing = patient.changing().to_vec();
         let observed = config.observed_states();
         let mut header = vec!["time_s".to_owned()];
         header.extend(observed.iter().map(|&i| Pressures::NAMES[i].to_owned()));
-        let create = |path: &PathBuf, header: &[String]| TableWriter::create(path, header);
+        let units = Units::of_model(&patient.model());
+        let create = |path: &PathBuf, header: &[String]| Table::create(path, header, &units);
         let mut truth =
             self.truth.as_ref().map(|p| create(p, &truth_header(patient.model(), &changing))).transpose()?;
         let mut noisy = self.observed.as_ref().map(|p| create(p, &header)).transpose()?;
@@ -78,8 +85,8 @@ impl Simulate {
                 table.row(&row)?;
             }
         }
-        truth.map(TableWriter::finish).transpose()?;
-        noisy.map(TableWriter::finish).transpose()?;
+        truth.map(Table::finish).transpose()?;
+        noisy.map(Table::finish).transpose()?;
         Ok(())
     }
 }

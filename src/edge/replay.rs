@@ -269,9 +269,13 @@ fn truth_names(patient: &SyntheticPatient) -> Vec<String> {
 /// has is lost. False if nobody did within a few seconds.
 pub fn wait_for_listener(bus: &dyn Bus, config: &Config, bed: &str, stop: &AtomicBool) -> bool {
     let channel = config.observed.first().map_or("", String::as_str);
-    let key = format!("{}/{bed}/pressure/{channel}", config.publish.prefix);
+    wait_for_listener_at(bus, &format!("{}/{bed}/pressure/{channel}", config.publish.prefix), stop)
+}
+
+/// The same for a key.
+pub fn wait_for_listener_at(bus: &dyn Bus, key: &str, stop: &AtomicBool) -> bool {
     for _ in 0..LISTENER_LOOKS {
-        if bus.is_wanted(&key) {
+        if bus.is_wanted(key) {
             return true;
         }
         if stop.load(Ordering::Relaxed) {
@@ -329,7 +333,7 @@ pub fn run(
     Ok(s_from_ns(sent_ns.into_iter().max().unwrap_or(0)))
 }
 
-fn wait_until(clock: &Clock, seconds: f64, stop: &AtomicBool) {
+pub(super) fn wait_until(clock: &Clock, seconds: f64, stop: &AtomicBool) {
     while !stop.load(Ordering::Relaxed) {
         let left = seconds - s_from_ns(clock.now().0);
         if left <= 0.0 {

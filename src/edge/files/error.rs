@@ -29,11 +29,11 @@ pub enum FileError {
 }
 
 impl FileError {
-    pub(super) fn file(path: &Path, error: &dyn Display) -> Self {
+    pub(in crate::edge) fn file(path: &Path, error: &dyn Display) -> Self {
         Self::File { path: path.to_owned(), reason: error.to_string() }
     }
 
-    pub(super) fn content(path: &Path, line: Option<u64>, found: impl Into<String>, expected: &str) -> Self {
+    pub(in crate::edge) fn content(path: &Path, line: Option<u64>, found: impl Into<String>, expected: &str) -> Self {
         Self::Content { path: path.to_owned(), line, found: found.into(), expected: expected.to_owned() }
     }
 }

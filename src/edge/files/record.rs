@@ -4,6 +4,7 @@ use std::path::Path;
 
 use super::csv::{RecordReader, Row};
 use super::error::FileError;
+use super::parquet::ParquetRows;
 use super::wfdb;
 use crate::edge::config::Config;
 use crate::estimate::time::EventTime;
@@ -13,12 +14,15 @@ use crate::model::cvsim6::Pressures;
 pub enum Record {
     /// Rows of a CSV file.
     Csv(Box<RecordReader>),
+    /// Rows of a Parquet file.
+    Parquet(Box<ParquetRows>),
     /// Signals of a WFDB record.
     Wfdb(WfdbRows),
 }
 
 impl Record {
-    /// Opens a record: WFDB if the path is that of a header, with or without its ending, otherwise CSV.
+    /// Opens a record: WFDB if the path is that of a header, with or without its ending; Parquet if it ends in
+    /// `.parquet`; otherwise CSV.
     ///
     /// # Errors
     /// When it cannot be read or holds no pressure.
@@ -26,6 +30,8 @@ impl Record {
         let is_header = path.extension().is_some_and(|ending| ending == "hea");
         if is_header || (!path.exists() && path.with_added_extension("hea").exists()) {
             Ok(Self::Wfdb(WfdbRows::open(path, config)?))
+        } else if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("parquet")) {
+            Ok(Self::Parquet(Box::new(ParquetRows::open(path, config)?)))
         } else {
             Ok(Self::Csv(Box::new(RecordReader::open(path, config)?)))
         }
@@ -36,6 +42,7 @@ impl Record {
     pub fn states(&self) -> &[usize] {
         match self {
             Self::Csv(reader) => reader.states(),
+            Self::Parquet(rows) => rows.states(),
             Self::Wfdb(rows) => &rows.states,
         }
     }
@@ -47,6 +54,7 @@ impl Record {
     pub fn next_row(&mut self) -> Result<Option<Row>, FileError> {
         match self {
             Self::Csv(reader) => Ok(reader.next_row()?),
+            Self::Parquet(rows) => rows.next_row(),
             Self::Wfdb(rows) => Ok(rows.next_row()),
         }
     }
@@ -56,6 +64,8 @@ impl Record {
 pub struct WfdbRows {
     states: Vec<usize>,
     signals: Vec<Samples>,
+    /// Event time of the first frame \[ns\].
+    start_ns: i64,
 }
 
 struct Samples {
@@ -93,7 +103,7 @@ impl WfdbRows {
             let expected = "a pressure in mmHg under a label of the table [labels]";
             return Err(FileError::content(path, None, found, expected));
         }
-        Ok(Self { states, signals })
+        Ok(Self { states, signals, start_ns: record.start_ns })
     }
 
     fn next_row(&mut self) -> Option<Row> {
@@ -105,6 +115,6 @@ impl WfdbRows {
             signal.next += 1;
             Some(signal.values[signal.next - 1]).filter(|value| !value.is_nan())
         });
-        Some(Row { time, values: values.collect() })
+        Some(Row { time: time.plus_ns(self.start_ns), values: values.collect() })
     }
 }

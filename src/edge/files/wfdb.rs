@@ -11,7 +11,7 @@
 //! - A record without signals, a file whose signals are scattered over the header, and names that leave the folder of
 //!   the header are refused.
 //!
-//! Deliberately absent: writing, annotations, differences (format 8), the formats 24, 32, 160, 310, 311 and FLAC (5xx),
+//! Deliberately absent: writing (see [`wfdb_write`](super::wfdb_write)), annotations, differences (format 8), the formats 24, 32, 160, 310, 311 and FLAC (5xx),
 //! EDF, search paths and networks. What a name or a unit means is the caller's business.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -39,6 +39,9 @@ const DEFAULT_GAIN: f64 = 200.0;
 
 const DEFAULT_UNITS: &str = "mV";
 
+/// Begins the comment in which a header of ours says when the first frame was \[ns\].
+pub(super) const START_COMMENT: &str = "hemostream_start_ns:";
+
 /// Name of a segment, or of a signal file, that stores nothing.
 const NOTHING_STORED: &str = "~";
 
@@ -65,6 +68,8 @@ pub struct Record {
     pub frames: usize,
     /// Time and date of the first frame, as the header writes them.
     pub start: Option<String>,
+    /// Event time of the first frame \[ns\]: what a header of ours says, else 0.
+    pub start_ns: i64,
     path: PathBuf,
     /// Whether segments arrange their signals as they like; else all have those of the record, in that order.
     variable: bool,
@@ -89,10 +94,11 @@ impl Record {
             _ => with_suffix(path),
         };
         let header = Header::read(&path)?;
-        match header.body {
-            Body::Signals(ordinary) => Self::ordinary(header.line, ordinary),
-            Body::Segments(lines) => Self::segmented(path, header.line, &lines),
-        }
+        let record = match header.body {
+            Body::Signals(ordinary) => Self::ordinary(header.line, ordinary)?,
+            Body::Segments(lines) => Self::segmented(path, header.line, &lines)?,
+        };
+        Ok(Self { start_ns: header.start_ns, ..record })
     }
 
     fn ordinary(line: RecordLine, source: Ordinary) -> Result<Self, FileError> {
@@ -103,6 +109,7 @@ impl Record {
             frame_rate_hz: rate_hz,
             frames,
             start: line.start,
+            start_ns: 0,
             path: source.path.clone(),
             variable: false,
             segments: vec![Segment { frames, source: Some(Arc::new(source)) }],
@@ -140,7 +147,7 @@ impl Record {
         };
         let frames = total_frames(&path, &line, lines)?;
         let signals = first.signals(rate_hz);
-        Ok(Self { signals, frame_rate_hz: rate_hz, frames, start: line.start, path, variable, segments })
+        Ok(Self { signals, frame_rate_hz: rate_hz, frames, start: line.start, start_ns: 0, path, variable, segments })
     }
 
     /// All samples of the signal at this place in [`Self::signals`], in its units; NaN where one is missing.
@@ -445,6 +452,7 @@ impl Format {
 struct Header {
     line: RecordLine,
     body: Body,
+    start_ns: i64,
 }
 
 enum Body {
@@ -470,6 +478,7 @@ impl Header {
 
     fn parse(path: &Path, text: &str) -> Result<Self, FileError> {
         let lines = text.lines().zip(1..).map(|(text, number)| Line { path, number, text: text.trim() });
+        let start_ns = start_comment(lines.clone())?;
         let mut lines = lines.filter(|line| !line.text.is_empty() && !line.text.starts_with('#'));
         let Some(first) = lines.next() else {
             return Err(FileError::content(path, None, "no line but comments", "a record line"));
@@ -489,8 +498,19 @@ impl Header {
             group(path, &mut channels)?;
             Body::Signals(Ordinary { path: path.to_owned(), frames: line.frames, channels })
         };
-        Ok(Self { line, body })
+        Ok(Self { line, body, start_ns })
     }
+}
+
+/// When the first frame was, if a comment of ours says so.
+fn start_comment<'a>(lines: impl Iterator<Item = Line<'a>>) -> Result<i64, FileError> {
+    for line in lines {
+        let said = line.text.strip_prefix('#').and_then(|comment| comment.trim_start().strip_prefix(START_COMMENT));
+        if let Some(said) = said {
+            return line.integer(Some(said.trim()), START_COMMENT).map(Option::unwrap_or_default);
+        }
+    }
+    Ok(0)
 }
 
 /// `NAME[/SEGMENTS] SIGNALS [RATE[/COUNTER[(BASE)]] [SAMPLES [TIME [DATE]]]]`
@@ -686,7 +706,7 @@ fn group(path: &Path, channels: &mut [Channel]) -> Result<(), FileError> {
     Ok(())
 }
 
-/// A line of a header that is neither empty nor a comment.
+/// A line of a header.
 struct Line<'a> {
     path: &'a Path,
     number: u64,

@@ -1,0 +1,455 @@
+//! From the bus to the files of a recording.
+
+use std::collections::BTreeMap;
+use std::fs::{File, TryLockError};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::time::Duration;
+
+use super::layout::{self, Part, Parts};
+use super::merge::{Job, Merger, merge};
+use super::tables::{self, BedMemory, Entry, Table};
+use crate::edge::bus::{Bus, BusError, Handler, Message, Subscription};
+use crate::edge::files::columnar::{Batch, Field, Writer};
+use crate::edge::files::error::FileError;
+use crate::edge::files::units::Units;
+use crate::edge::wire;
+use crate::estimate::time::ns_from_s;
+use crate::runtime::clock::{Clock, unix_time};
+
+/// What is recorded, under `PREFIX/BED/`. No JSON twins, which would be made for the recorder only.
+const TOPICS: [&str; 12] = [
+    "pressure/*",
+    "beat",
+    "truth",
+    "note",
+    "acknowledge",
+    "estimate/state",
+    "estimate/parameters",
+    "estimate/beat",
+    "estimate/smoothed",
+    "status",
+    "event",
+    "alarm",
+];
+/// Recorded if asked for: the whole ensemble is made only for those who subscribe.
+const MEMBERS: &str = "estimate/members";
+
+/// Messages between the bus and the recorder, and their bytes; more are dropped and counted.
+const QUEUE: usize = 1 << 17;
+const QUEUE_BYTES: usize = 256 << 20;
+
+/// Longest wait for a message before looking at what is due.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Parts of an hour that were never merged, at most: then they are.
+const SMALL_PARTS: u64 = 32;
+
+/// Cells of one table and bed, and of all, that wait to be written: 4 MiB and 256 MiB.
+const MAX_CELLS: usize = 1 << 18;
+const MAX_ALL_CELLS: usize = 1 << 24;
+
+/// Says which schema of the wire the rows come from, and which table they are.
+const WIRE_KEY: &str = "hemostream.wire";
+const TABLE_KEY: &str = "hemostream.table";
+
+/// How to record.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RecordOptions {
+    /// First part of the keys.
+    pub prefix: String,
+    /// Beds to record; empty for all.
+    pub beds: Vec<String>,
+    /// Whether whole ensembles are recorded.
+    pub members: bool,
+    /// Longest time that a row waits in memory \[s\].
+    pub flush_s: f64,
+    /// Most beds; messages of others are refused.
+    pub max_beds: usize,
+}
+
+/// What was recorded.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Summary {
+    /// Rows by table.
+    pub rows: BTreeMap<&'static str, u64>,
+    /// Beds seen.
+    pub beds: usize,
+    /// Files written, before merging.
+    pub parts: u64,
+    /// Their bytes.
+    pub bytes: u64,
+    /// Messages that were not recorded, by cause.
+    pub refused: BTreeMap<&'static str, u64>,
+    /// Messages that found the queue full.
+    pub dropped: u64,
+}
+
+/// Why a recording ends badly.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// The disk.
+    #[error("recording: {0}")]
+    File(#[from] FileError),
+    /// The bus.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+}
+
+/// Rows of one table and bed that wait to be written.
+struct Buffer {
+    hour: String,
+    folder: PathBuf,
+    names: Vec<String>,
+    units: Vec<String>,
+    fields: Vec<Field>,
+    batch: Batch,
+    /// Arrival of its first row \[ns\].
+    since_ns: i64,
+    next_part: u64,
+    /// Parts since the last merge.
+    small: u64,
+}
+
+impl Buffer {
+    fn cells(&self) -> usize {
+        self.batch.rows() * self.fields.len()
+    }
+}
+
+/// Writes what it is told. Knows no clock: times of arrival are arguments.
+pub struct Recorder {
+    directory: PathBuf,
+    options: RecordOptions,
+    units: Units,
+    buffers: BTreeMap<(String, Table), Buffer>,
+    beds: BTreeMap<String, BedMemory>,
+    /// Cells in all buffers.
+    cells: usize,
+    last_arrival: i64,
+    summary: Summary,
+    merger: Merger,
+    /// Held for as long as this recorder writes here.
+    _lock: File,
+}
+
+impl Recorder {
+    /// Opens a directory, new or recorded into before; removes what an interruption left and merges the hours that are
+    /// over by `now_ns`.
+    ///
+    /// # Errors
+    /// When it cannot be written, or somebody else records into it.
+    pub fn open(directory: &Path, options: RecordOptions, units: Units, now_ns: i64) -> Result<Self, FileError> {
+        std::fs::create_dir_all(directory).map_err(|e| FileError::file(directory, &e))?;
+        let lock = lock(directory)?;
+        let merger = Merger::start().map_err(|e| FileError::file(directory, &e))?;
+        tidy(directory, now_ns)?;
+        Ok(Self {
+            directory: directory.to_owned(),
+            options,
+            units,
+            buffers: BTreeMap::new(),
+            beds: BTreeMap::new(),
+            cells: 0,
+            last_arrival: i64::MIN,
+            summary: Summary::default(),
+            merger,
+            _lock: lock,
+        })
+    }
+
+    /// Takes a message that arrived at a unix time \[ns\]. No two messages share an arrival: one that is not after the last
+    /// gets the next nanosecond.
+    ///
+    /// # Errors
+    /// When the disk does not take what is due.
+    pub fn take(&mut self, message: &Message, arrival_ns: i64) -> Result<(), FileError> {
+        let Some((bed, topic)) = self.address(&message.key) else { return Ok(()) };
+        let (bed, topic) = (bed.to_owned(), topic.to_owned());
+        let arrival = arrival_ns.max(self.last_arrival.saturating_add(1));
+        self.last_arrival = arrival;
+        if let Err(cause) = self.add(&bed, &topic, message, arrival)? {
+            *self.summary.refused.entry(cause).or_default() += 1;
+        }
+        Ok(())
+    }
+
+    /// Bed and topic of a key, if it is recorded.
+    fn address<'a>(&self, key: &'a str) -> Option<(&'a str, &'a str)> {
+        let (bed, topic) = key.strip_prefix(&self.options.prefix)?.strip_prefix('/')?.split_once('/')?;
+        let wanted = self.options.beds.is_empty() || self.options.beds.iter().any(|b| b == bed);
+        wanted.then_some((bed, topic))
+    }
+
+    fn add(
+        &mut self,
+        bed: &str,
+        topic: &str,
+        message: &Message,
+        arrival: i64,
+    ) -> Result<Result<(), tables::Refused>, FileError> {
+        let known = self.beds.contains_key(bed);
+        if !known && self.beds.len() >= self.options.max_beds {
+            return Ok(Err("too_many_beds"));
+        }
+        let memory = self.beds.entry(bed.to_owned()).or_default();
+        let outcome = match tables::entry(topic, message, arrival, memory) {
+            Ok(entry) => self.add_entry(bed, entry, arrival)?,
+            Err(cause) => Err(cause),
+        };
+        // What nobody understands makes no bed.
+        if outcome.is_err() && !known {
+            self.beds.remove(bed);
+        }
+        Ok(outcome)
+    }
+
+    fn add_entry(&mut self, bed: &str, entry: Entry, arrival: i64) -> Result<Result<(), tables::Refused>, FileError> {
+        let Some(folder) = layout::escape(bed) else { return Ok(Err("bed_name")) };
+        if entry.rows.is_empty() {
+            return Ok(Ok(()));
+        }
+        let key = (bed.to_owned(), entry.table);
+        let hour = layout::hour(arrival);
+        let fits = |b: &Buffer| b.hour == hour && b.names == entry.names && b.units == entry.units;
+        if !self.buffers.get(&key).is_some_and(fits) {
+            let fields = match tables::fields(&entry, &self.units) {
+                Ok(fields) => fields,
+                Err(cause) => return Ok(Err(cause)),
+            };
+            self.begin(&key, &folder, hour, &entry, fields)?;
+        }
+        self.push(&key, entry, arrival)?;
+        Ok(Ok(()))
+    }
+
+    /// Begins a buffer; what is in one of another hour or of other columns is written.
+    fn begin(
+        &mut self,
+        key: &(String, Table),
+        folder: &str,
+        hour: String,
+        entry: &Entry,
+        fields: Vec<Field>,
+    ) -> Result<(), FileError> {
+        self.write(key)?;
+        let folder = layout::folder(&self.directory, entry.table.name(), folder, &hour);
+        let before = self.buffers.remove(key);
+        let (next_part, small) = match &before {
+            Some(before) if before.hour == hour => (before.next_part, before.small),
+            _ => (Parts::of(&folder)?.next(), 0),
+        };
+        if let Some(before) = before.filter(|before| before.hour != hour) {
+            // An hour that finds no place is merged at the next start.
+            let _ = self.merger.ask(Job { folder: before.folder, all: true });
+        }
+        let (names, units, batch) = (entry.names.clone(), entry.units.clone(), Batch::new(&fields));
+        let buffer = Buffer { hour, folder, names, units, fields, batch, since_ns: 0, next_part, small };
+        self.buffers.insert(key.clone(), buffer);
+        Ok(())
+    }
+
+    fn push(&mut self, key: &(String, Table), entry: Entry, arrival: i64) -> Result<(), FileError> {
+        let Some(buffer) = self.buffers.get_mut(key) else { return Ok(()) };
+        if buffer.batch.rows() == 0 {
+            buffer.since_ns = arrival;
+        }
+        *self.summary.rows.entry(entry.table.name()).or_default() += entry.rows.len() as u64;
+        let before = buffer.cells();
+        entry.rows.into_iter().for_each(|row| buffer.batch.push(row));
+        self.cells += buffer.cells() - before;
+        if buffer.cells() >= MAX_CELLS {
+            self.write(key)?;
+        }
+        if self.cells >= MAX_ALL_CELLS { self.write_all() } else { Ok(()) }
+    }
+
+    /// Writes what has waited long enough by a unix time, and lets go of hours that are over.
+    ///
+    /// # Errors
+    /// When the disk does not take it.
+    pub fn flush_due(&mut self, now_ns: i64) -> Result<(), FileError> {
+        let flush_ns = ns_from_s(self.options.flush_s);
+        let waits = |b: &Buffer| b.batch.rows() > 0 && now_ns.saturating_sub(b.since_ns) >= flush_ns;
+        let due: Vec<_> = self.buffers.iter().filter(|(_, b)| waits(b)).map(|(key, _)| key.clone()).collect();
+        due.iter().try_for_each(|key| self.write(key))?;
+        let hour = layout::hour(now_ns);
+        let over = |b: &Buffer| b.batch.rows() == 0 && b.hour < hour;
+        let over: Vec<_> = self.buffers.iter().filter(|(_, b)| over(b)).map(|(key, _)| key.clone()).collect();
+        for buffer in over.iter().filter_map(|key| self.buffers.remove(key)) {
+            let _ = self.merger.ask(Job { folder: buffer.folder, all: true });
+        }
+        Ok(())
+    }
+
+    fn write_all(&mut self) -> Result<(), FileError> {
+        let keys: Vec<_> = self.buffers.keys().cloned().collect();
+        keys.iter().try_for_each(|key| self.write(key))
+    }
+
+    /// Makes a file of what waits in a buffer.
+    fn write(&mut self, key: &(String, Table)) -> Result<(), FileError> {
+        let Some(buffer) = self.buffers.get_mut(key).filter(|b| b.batch.rows() > 0) else { return Ok(()) };
+        std::fs::create_dir_all(&buffer.folder).map_err(|e| FileError::file(&buffer.folder, &e))?;
+        let part = Part::new(&buffer.folder, buffer.next_part, buffer.next_part);
+        let about = [(WIRE_KEY, wire::SCHEMA.to_string()), (TABLE_KEY, key.1.name().to_owned())];
+        let mut writer = Writer::create(&part.path, buffer.fields.clone(), &about)?;
+        self.cells -= buffer.cells();
+        writer.batch(std::mem::replace(&mut buffer.batch, Batch::new(&buffer.fields)))?;
+        self.summary.bytes += writer.finish()?;
+        self.summary.parts += 1;
+        buffer.next_part += 1;
+        buffer.small += 1;
+        if buffer.small >= SMALL_PARTS && self.merger.ask(Job { folder: buffer.folder.clone(), all: false }) {
+            buffer.small = 0;
+        }
+        Ok(())
+    }
+
+    /// Writes what is left and merges what is small.
+    ///
+    /// # Errors
+    /// When the disk does not take it.
+    pub fn close(mut self) -> Result<Summary, FileError> {
+        self.write_all()?;
+        for buffer in self.buffers.values() {
+            let _ = self.merger.ask(Job { folder: buffer.folder.clone(), all: false });
+        }
+        Ok(Summary { beds: self.beds.len(), ..self.summary })
+    }
+}
+
+/// One recorder per directory: two would give their parts the same names.
+fn lock(directory: &Path) -> Result<File, FileError> {
+    let path = directory.join(".lock");
+    let file = File::create(&path).map_err(|e| FileError::file(&path, &e))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => {
+            Err(FileError::content(directory, None, "another recorder at work", "a directory of its own for each"))
+        }
+        Err(TryLockError::Error(error)) => Err(FileError::file(&path, &error)),
+    }
+}
+
+/// Removes what an interruption left, and merges the hours that are over.
+fn tidy(directory: &Path, now_ns: i64) -> Result<(), FileError> {
+    let current = format!("hour={}", layout::hour(now_ns));
+    for table in Table::ALL {
+        for (_, bed) in layout::beds(directory, table.name())? {
+            for folder in layout::hours(&bed)? {
+                let parts = Parts::of(&folder)?;
+                parts.clean()?;
+                if parts.live.len() > 1 && !folder.ends_with(&current) {
+                    // A part that somebody damaged is no reason not to record.
+                    if let Err(error) = merge(&Job { folder, all: true }) {
+                        tracing::warn!("parts are left unmerged: {error}");
+                    }
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Wall clock that never goes back: set once, and counted on from there.
+#[derive(Clone, Copy)]
+struct ArrivalClock {
+    start_ns: i64,
+    clock: Clock,
+}
+
+impl ArrivalClock {
+    fn start() -> Self {
+        Self { start_ns: unix_time().0, clock: Clock::start() }
+    }
+
+    fn now_ns(&self) -> i64 {
+        self.start_ns.saturating_add(self.clock.now().0)
+    }
+}
+
+/// A bounded queue between the threads of the bus and the recorder.
+struct Queue {
+    receiver: Receiver<(i64, Message)>,
+    bytes: Arc<AtomicUsize>,
+    dropped: Arc<AtomicU64>,
+}
+
+fn subscribe(
+    bus: &dyn Bus,
+    options: &RecordOptions,
+    clock: ArrivalClock,
+) -> Result<(Vec<Subscription>, Queue), BusError> {
+    let (sender, receiver): (SyncSender<(i64, Message)>, _) = sync_channel(QUEUE);
+    let queue = Queue { receiver, bytes: Arc::default(), dropped: Arc::default() };
+    let (bytes, dropped) = (Arc::clone(&queue.bytes), Arc::clone(&queue.dropped));
+    let handler: Handler = Arc::new(move |message| {
+        let length = message.payload.len() + message.key.len();
+        let has_room = bytes.fetch_add(length, Ordering::Relaxed) + length <= QUEUE_BYTES;
+        if !has_room || sender.try_send((clock.now_ns(), message)).is_err() {
+            bytes.fetch_sub(length, Ordering::Relaxed);
+            dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    });
+    let topics = TOPICS.iter().copied().chain(options.members.then_some(MEMBERS));
+    let beds: Vec<&str> = match options.beds.as_slice() {
+        [] => vec!["*"],
+        beds => beds.iter().map(String::as_str).collect(),
+    };
+    let patterns = topics.flat_map(|topic| beds.iter().map(move |bed| format!("{}/{bed}/{topic}", options.prefix)));
+    let subscriptions = patterns.map(|pattern| bus.subscribe(&pattern, Arc::clone(&handler)));
+    Ok((subscriptions.collect::<Result<_, _>>()?, queue))
+}
+
+/// Records until `stop` is set. `progress` is told rows and dropped messages now and then.
+///
+/// # Errors
+/// When the bus refuses the subscription or the disk does not take what is due.
+pub fn run(
+    bus: &dyn Bus,
+    directory: &Path,
+    options: RecordOptions,
+    units: Units,
+    stop: &AtomicBool,
+    progress: &mut dyn FnMut(u64, u64),
+) -> Result<Summary, RecordError> {
+    let clock = ArrivalClock::start();
+    let mut recorder = Recorder::open(directory, options.clone(), units, clock.now_ns())?;
+    let (subscriptions, queue) = subscribe(bus, &options, clock)?;
+    let mut looked_ns = clock.now_ns();
+    let mut said = 0;
+    while !stop.load(Ordering::Relaxed) {
+        match queue.receiver.recv_timeout(LOOK) {
+            Ok((arrival, message)) => queue.record(&mut recorder, &message, arrival)?,
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => break,
+        }
+        let now_ns = clock.now_ns();
+        if now_ns - looked_ns >= i64::try_from(LOOK.as_nanos()).unwrap_or(0) {
+            looked_ns = now_ns;
+            recorder.flush_due(now_ns)?;
+            let dropped = queue.dropped.load(Ordering::Relaxed);
+            if dropped > said {
+                tracing::warn!(dropped, "messages were dropped because the disk was behind");
+                said = (2 * dropped).max(1);
+            }
+            progress(recorder.summary.rows.values().sum(), dropped);
+        }
+    }
+    drop(subscriptions);
+    while let Ok((arrival, message)) = queue.receiver.try_recv() {
+        queue.record(&mut recorder, &message, arrival)?;
+    }
+    let dropped = queue.dropped.load(Ordering::Relaxed);
+    Ok(Summary { dropped, ..recorder.close()? })
+}
+
+impl Queue {
+    fn record(&self, recorder: &mut Recorder, message: &Message, arrival: i64) -> Result<(), FileError> {
+        self.bytes.fetch_sub(message.payload.len() + message.key.len(), Ordering::Relaxed);
+        recorder.take(message, arrival)
+    }
+}

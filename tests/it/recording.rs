@@ -1,0 +1,431 @@
+//! Recordings: everything that crosses the bus, on the disk and back.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use hemostream::edge::bus::{Bus, Delivery, Encoding, MemoryBus, Message};
+use hemostream::edge::config::Config;
+use hemostream::edge::files::columnar::{Column, Reader};
+use hemostream::edge::files::units::Units;
+use hemostream::edge::inlet;
+use hemostream::edge::outlet::Outlet;
+use hemostream::edge::recording::layout::{self, Parts};
+use hemostream::edge::recording::merge::{Job, merge};
+use hemostream::edge::recording::playback::{Playback, play};
+use hemostream::edge::recording::recorder::{self, RecordOptions, Recorder, Summary};
+use hemostream::edge::replay::{Bed, ReplayOptions, Source, run};
+use hemostream::edge::wire::{
+    self, Acknowledge, Alarm, Alarms, Beats, Header, Note, PressureBlock, SCHEMA, StateEstimate, Truth,
+};
+use hemostream::runtime::clock::Clock;
+use hemostream::runtime::service::{Limits, Service};
+use hemostream::runtime::workers::Workers;
+use serde::Serialize;
+
+const S: i64 = 1_000_000_000;
+/// 2026-01-01T00:59:50Z: an hour is over soon.
+const START: i64 = 1_767_229_190 * S;
+
+fn config() -> Config {
+    let sets = [
+        "estimator.members=8",
+        "window.length_s=0.005",
+        "window.allowed_lateness_s=600",
+        "observed=[\"p_a\", \"p_pa\"]",
+        "service.workers=2",
+        "publish.rate_hz=50",
+    ];
+    Config::load_from(None, [], &sets.map(str::to_owned)).unwrap().0
+}
+
+fn options() -> RecordOptions {
+    RecordOptions { prefix: "hemostream".to_owned(), beds: Vec::new(), members: false, flush_s: 2.0, max_beds: 4 }
+}
+
+fn open(directory: &Path, now_ns: i64) -> Recorder {
+    Recorder::open(directory, options(), Units::of_model(&config().circulation().unwrap()), now_ns).unwrap()
+}
+
+fn message(bed: &str, topic: &str, content: &impl Serialize) -> Message {
+    let payload = wire::encode(content).unwrap();
+    Message { key: format!("hemostream/{bed}/{topic}"), encoding: Encoding::Bincode, payload }
+}
+
+fn block(sequence: u64, start_ns: i64, values: &[f64]) -> PressureBlock {
+    let (values, offsets_ns) = (values.to_vec(), (0..values.len() as i64).map(|i| i * 5_000_000 + i % 3).collect());
+    PressureBlock { schema: SCHEMA, sequence, flags: 0, start_ns, period_ns: 0, offsets_ns, values }
+}
+
+/// Every file of a table and bed that counts, in order.
+fn files(directory: &Path, table: &str, bed: &str) -> Vec<PathBuf> {
+    let beds = layout::beds(directory, table).unwrap();
+    let Some((_, folder)) = beds.into_iter().find(|(name, _)| name == bed) else { return Vec::new() };
+    let hours = layout::hours(&folder).unwrap();
+    hours.iter().flat_map(|hour| Parts::of(hour).unwrap().live).map(|part| part.path).collect()
+}
+
+/// All rows of a table and bed as text with the bits of floats; columns are named before each.
+fn rows(directory: &Path, table: &str, bed: &str, without: &[&str]) -> Vec<String> {
+    let mut rows = Vec::new();
+    for path in files(directory, table, bed) {
+        let mut reader = Reader::open(&path).unwrap();
+        let names: Vec<String> = reader.fields().iter().map(|f| f.name.clone()).collect();
+        while let Some(batch) = reader.next_batch(1000).unwrap() {
+            for row in 0..batch.rows() {
+                let cell = |column: &Column| match column {
+                    Column::Int(cells) => format!("{:?}", cells[row]),
+                    Column::Float(cells) => format!("{:?}", cells[row].map(f64::to_bits)),
+                    Column::Text(cells) => cells[row].to_string(),
+                };
+                let named = names.iter().zip(batch.columns()).filter(|(name, _)| !without.contains(&name.as_str()));
+                rows.push(named.map(|(name, column)| format!("{name}={}", cell(column))).collect::<Vec<_>>().join(" "));
+            }
+        }
+    }
+    rows
+}
+
+fn played(directory: &Path, beds: &[&str]) -> Vec<(i64, Message)> {
+    let beds: Vec<String> = beds.iter().map(|b| (*b).to_owned()).collect();
+    let mut playback = Playback::open(directory, &beds, "hemostream").unwrap();
+    std::iter::from_fn(|| playback.next_message().unwrap()).collect()
+}
+
+#[test]
+fn what_came_in_comes_back_bit_for_bit_in_the_order_of_arrival() {
+    let directory = tempfile::tempdir().unwrap();
+    let nan = f64::from_bits(0x7ff8_0000_dead_beef);
+    let (empty, last) = (block(u64::MAX, -7, &[]), PressureBlock { flags: 1, ..block(2, 5, &[nan]) });
+    let truth = Truth { schema: SCHEMA, time_ns: 3, names: vec!["p_l".into(), "r_pv".into()], values: vec![-0.0, 0.1] };
+    let period = PressureBlock { period_ns: 8, offsets_ns: vec![], ..block(9, 100, &[1.0, 2.0, 3.0]) };
+    let note = Note { schema: SCHEMA, time_ns: 4, author: "N. N.".into(), text: "\"flush\",\nthen quiet".into() };
+    let sent = [
+        ("bed 1/x", "pressure/ART", message("b", "t", &block(0, 10, &[80.0, f64::INFINITY, nan, 5e-324]))),
+        ("icu", "pressure/p_pa", message("b", "t", &empty)),
+        ("icu", "truth", message("b", "t", &truth)),
+        ("icu", "beat", message("b", "t", &Beats { schema: SCHEMA, onsets_ns: vec![5, i64::MIN] })),
+        ("bed 1/x", "note", message("b", "t", &note)),
+        (
+            "icu",
+            "acknowledge",
+            message("b", "t", &Acknowledge { schema: SCHEMA, alarm: "low".into(), author: "me".into() }),
+        ),
+        ("icu", "pressure/p_pa", message("b", "t", &last)),
+        // Twice the same at the same time.
+        ("icu", "pressure/p_pa", message("b", "t", &last)),
+        ("icu", "pressure/p_a", message("b", "t", &period)),
+    ];
+    let mut recorder = open(directory.path(), START);
+    let mut expected = Vec::new();
+    for (i, (bed, topic, content)) in sent.into_iter().enumerate() {
+        // A slash cannot be in the name of a bed on the bus.
+        let message = Message { key: format!("hemostream/{}/{topic}", bed.replace('/', "+")), ..content };
+        let arrival = START + (i as i64).min(7) * 3 * S;
+        recorder.take(&message, arrival).unwrap();
+        expected.push((arrival + i64::from(i == 8), message));
+    }
+    let explicit = PressureBlock { period_ns: 0, offsets_ns: vec![0, 8, 16], ..period };
+    expected[8].1.payload = wire::encode(&explicit).unwrap();
+    let summary = recorder.close().unwrap();
+    assert_eq!((summary.beds, summary.rows["samples"], summary.rows["events"]), (2, 10, 4));
+    assert!(summary.refused.is_empty());
+
+    assert!(played(directory.path(), &[]) == expected);
+    let icu: Vec<_> = expected.iter().filter(|(_, m)| m.key.contains("/icu/")).cloned().collect();
+    assert!(played(directory.path(), &["icu"]) == icu);
+    assert!(directory.path().join("samples/bed=bed%201%2Bx/hour=2026-01-01T00").is_dir());
+    assert!(directory.path().join("samples/bed=icu/hour=2026-01-01T01").is_dir());
+    let nobody = Playback::open(directory.path(), &["nobody".to_owned()], "p").err().unwrap().to_string();
+    assert!(nobody.contains("found no bed `nobody`"), "{nobody}");
+    assert!(Playback::open(&directory.path().join("none"), &[], "p").is_err());
+}
+
+#[test]
+fn what_is_not_understood_is_counted_and_names_cannot_break_a_table() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut recorder = open(directory.path(), START);
+    let truth = |names: &[&str], values: &[f64]| Truth {
+        schema: SCHEMA,
+        time_ns: 0,
+        names: names.iter().map(|n| (*n).to_owned()).collect(),
+        values: values.to_vec(),
+    };
+    let odd = PressureBlock { offsets_ns: vec![0], ..block(0, 0, &[1.0, 2.0]) };
+    let bad = [
+        message("a", "truth", &truth(&["x", "x"], &[1.0, 2.0])),
+        message("a", "truth", &truth(&["time_ns"], &[1.0])),
+        message("a", "truth", &truth(&[""], &[1.0])),
+        message("a", "truth", &truth(&["x"], &[])),
+        message("a", "pressure/p_a", &odd),
+        Message { payload: vec![1, 2, 3], ..message("a", "status", &1_u8) },
+    ];
+    bad.iter().for_each(|m| recorder.take(m, START).unwrap());
+    for bed in 0..6 {
+        recorder.take(&message(&format!("bed{bed}"), "truth", &truth(&["x"], &[1.0])), START).unwrap();
+    }
+    recorder.take(&message("bed0", "elsewhere", &1_u8), START).unwrap();
+    recorder.take(&Message { key: "other/bed0/truth".to_owned(), ..bad[0].clone() }, START).unwrap();
+    let summary = recorder.close().unwrap();
+    assert_eq!(summary.refused, BTreeMap::from([("malformed", 6), ("too_many_beds", 2), ("unknown_topic", 1)]));
+    assert_eq!(summary.rows, BTreeMap::from([("truth", 4)]));
+}
+
+#[test]
+fn of_alarms_the_changes_are_recorded() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut recorder = open(directory.path(), START);
+    let alarm = |name: &str, state: &str, acknowledged: bool| Alarm {
+        name: name.to_owned(),
+        quantity: "p_a".to_owned(),
+        unit: "mmHg".to_owned(),
+        priority: "high".to_owned(),
+        state: state.to_owned(),
+        acknowledged,
+        side: "below".to_owned(),
+        limit: 60.0,
+        since_ns: 1,
+        band: [50.0, 45.0, 55.0],
+        text: format!("{name} is {state}"),
+    };
+    let steps = [
+        [("map", "normal", false), ("pap", "normal", false)],
+        [("map", "active", false), ("pap", "normal", false)],
+        [("map", "active", true), ("pap", "pending", false)],
+    ];
+    for (i, step) in steps.iter().enumerate() {
+        let header =
+            Header { schema: SCHEMA, seed: 7, config_hash: u64::MAX - 1, sequence: i as u64, time_ns: i as i64 };
+        let alarms = Alarms { header, alarms: step.iter().map(|(n, s, a)| alarm(n, s, *a)).collect() };
+        recorder.take(&message("icu", "alarm", &alarms), START + i as i64).unwrap();
+    }
+    recorder.close().unwrap();
+    let rows = rows(directory.path(), "events", "icu", &["arrival", "detail", "author"]);
+    let row = |kind: &str, name: &str, i: usize| {
+        format!(
+            "source=alarm kind={kind} channel=p_a name={name} text={name} is {kind} time_ns=Some({i}) \
+             sequence=Some({i}) seed=Some(7) config_hash=fffffffffffffffe"
+        )
+    };
+    let expected =
+        [("normal", "map", 0), ("normal", "pap", 0), ("active", "map", 1), ("active", "map", 2), ("pending", "pap", 2)];
+    assert_eq!(rows, expected.map(|(kind, name, i)| row(kind, name, i)));
+}
+
+fn state(sequence: u64, names: &[&str]) -> StateEstimate {
+    let header = Header { schema: SCHEMA, seed: 1, config_hash: 2, sequence, time_ns: sequence as i64 };
+    let values = (0..names.len() * 7).map(|i| sequence as f64 + i as f64 / 100.0).collect();
+    let names = names.iter().map(|n| (*n).to_owned()).collect();
+    StateEstimate { header, members: 8, times_ns: vec![sequence as i64], since_data_s: vec![0.0], names, values }
+}
+
+#[test]
+fn parts_are_merged_when_many_and_when_the_hour_is_over_and_other_columns_begin_another_file() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut recorder = open(directory.path(), START - 200 * S);
+    let mut expected = Vec::new();
+    for i in 0..40_u64 {
+        let now = START + (i as i64 - 40) * 3 * S;
+        recorder.take(&message("icu", "estimate/state", &state(i, &["p_a"])), now).unwrap();
+        recorder.flush_due(now + 2 * S).unwrap();
+        expected.push(i);
+    }
+    recorder.take(&message("icu", "estimate/state", &state(40, &["p_a", "p_v"])), START).unwrap();
+    recorder.take(&message("icu", "estimate/state", &state(41, &["p_a"])), START + 1).unwrap();
+    // Another hour.
+    recorder.take(&message("icu", "estimate/state", &state(42, &["p_a"])), START + 11 * S).unwrap();
+    expected.extend([40, 41, 42]);
+    recorder.close().unwrap();
+    let names: Vec<String> = files(directory.path(), "estimates", "icu")
+        .iter()
+        .map(|path| path.file_name().unwrap().to_str().unwrap().to_owned())
+        .collect();
+    let merged = ["part-000000-000039.parquet", "part-000040.parquet", "part-000041.parquet", "part-000000.parquet"];
+    assert_eq!(names, merged);
+    let sequences: Vec<String> = rows(directory.path(), "estimates", "icu", &[])
+        .iter()
+        .map(|row| row.split(' ').find(|cell| cell.starts_with("sequence=")).unwrap().to_owned())
+        .collect();
+    assert_eq!(sequences, expected.iter().map(|i| format!("sequence=Some({i})")).collect::<Vec<_>>());
+    let reader = Reader::open(&files(directory.path(), "estimates", "icu")[0]).unwrap();
+    let unit = |name: &str| reader.fields()[reader.column(name).unwrap()].unit.clone();
+    assert_eq!((unit("p_a_q05"), unit("since_data_s")), ("mmHg".to_owned(), "s".to_owned()));
+    assert_eq!(
+        (reader.metadata("hemostream.wire"), reader.metadata("hemostream.table")),
+        (Some("2"), Some("estimates"))
+    );
+}
+
+/// Every state in which a crash can leave a merge, and what the next start makes of it.
+#[test]
+fn nothing_is_lost_or_doubled_by_an_interruption() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut recorder = open(directory.path(), START);
+    for i in 0..5 {
+        recorder.take(&message("icu", "pressure/p_a", &block(i, 0, &[1.0, 2.0])), START + i as i64).unwrap();
+        recorder.flush_due(START + 3 * S).unwrap();
+    }
+    // What waits in memory dies with the recorder; what was flushed does not.
+    recorder.take(&message("icu", "pressure/p_a", &block(5, 0, &[3.0])), START + 9).unwrap();
+    drop(recorder);
+    let before = rows(directory.path(), "samples", "icu", &[]);
+    assert_eq!(before.len(), 10);
+    let folder = files(directory.path(), "samples", "icu")[0].parent().unwrap().to_owned();
+    let kept: Vec<(PathBuf, Vec<u8>)> = files(directory.path(), "samples", "icu")
+        .into_iter()
+        .map(|path| (path.clone(), std::fs::read(path).unwrap()))
+        .collect();
+    merge(&Job { folder: folder.clone(), all: false }).unwrap();
+    assert_eq!(rows(directory.path(), "samples", "icu", &[]), before);
+    // As if the crash had come before the parts were removed: all of them, then some.
+    for from in [0, 3] {
+        for (path, bytes) in &kept[from..] {
+            std::fs::write(path, bytes).unwrap();
+        }
+        std::fs::write(folder.join(".part-000005.parquet.tmp"), "half").unwrap();
+        assert_eq!(rows(directory.path(), "samples", "icu", &[]), before, "readers of ours pass over leftovers");
+        let recorder = open(directory.path(), START + 60 * S);
+        assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1, "the next start removes them");
+        drop(recorder);
+        assert_eq!(rows(directory.path(), "samples", "icu", &[]), before);
+    }
+    // It goes on behind what is there.
+    let mut recorder = open(directory.path(), START + 60 * S);
+    recorder.take(&message("icu", "pressure/p_a", &block(6, 0, &[4.0])), START + S).unwrap();
+    recorder.close().unwrap();
+    assert!(folder.join("part-000005.parquet").exists());
+    assert_eq!(rows(directory.path(), "samples", "icu", &[]).len(), 11);
+    // A later hour: what is over is merged at the start.
+    drop(open(directory.path(), START + 7200 * S));
+    assert!(folder.join("part-000000-000005.parquet").exists());
+    assert_eq!(rows(directory.path(), "samples", "icu", &[]).len(), 11);
+}
+
+#[test]
+fn two_recorders_do_not_share_a_directory_and_a_file_is_none() {
+    let directory = tempfile::tempdir().unwrap();
+    let one = open(directory.path(), START);
+    let other = |path: &Path| Recorder::open(path, options(), Units::default(), START).err().unwrap().to_string();
+    assert!(other(directory.path()).contains("another recorder at work"), "{}", other(directory.path()));
+    drop(one);
+    drop(open(directory.path(), START));
+    let file = directory.path().join("file");
+    std::fs::write(&file, "").unwrap();
+    assert!(other(&file).contains("file"), "{}", other(&file));
+}
+
+/// A recorder on a bus, in a thread of its own.
+struct Recording {
+    stop: Arc<AtomicBool>,
+    thread: std::thread::JoinHandle<Summary>,
+}
+
+impl Recording {
+    fn start(bus: &MemoryBus, directory: &Path) -> Self {
+        let stop = Arc::new(AtomicBool::new(false));
+        let (bus, directory, stopped) = (bus.clone(), directory.to_owned(), Arc::clone(&stop));
+        let wanted = bus.clone();
+        let thread = std::thread::spawn(move || {
+            let units = Units::of_model(&config().circulation().unwrap());
+            recorder::run(&bus, &directory, options(), units, &stopped, &mut |_, _| {}).unwrap()
+        });
+        while !wanted.is_wanted("hemostream/bed1/alarm") {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        assert!(!wanted.is_wanted("hemostream/bed1/estimate/members"));
+        assert!(!wanted.is_wanted("hemostream/bed1/estimate/state/json"));
+        Self { stop, thread }
+    }
+
+    fn stop(self) -> Summary {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.join().unwrap()
+    }
+}
+
+/// Runs a daemon on a bus while `publish` does its work, and records it all.
+async fn recorded(directory: &Path, publish: impl FnOnce(&MemoryBus) + Send + 'static) -> Summary {
+    let (bus, config) = (MemoryBus::new(), config());
+    let recording = Recording::start(&bus, directory);
+    let workers = Arc::new(Workers::start(2).unwrap());
+    let outlet = Arc::new(Outlet::start(Arc::new(bus.clone()), &config).unwrap());
+    let limits = Limits { max_beds: 8, queue_tasks: 1 << 16, report_every: Duration::from_secs(1) };
+    let (model, settings) = (config.circulation().unwrap(), config.estimator_settings().unwrap());
+    let sink = Arc::clone(&outlet);
+    let (service, inlet) = Service::new(model, settings, limits, workers, sink, Clock::start()).unwrap();
+    let service = tokio::spawn(service.run());
+    let subscriptions = inlet::listen(&bus, &config, inlet.clone()).unwrap();
+    let published = bus.clone();
+    tokio::task::spawn_blocking(move || publish(&published)).await.unwrap();
+    inlet.stop().await;
+    service.await.unwrap();
+    assert_eq!(inlet.dropped(), 0);
+    drop((subscriptions, outlet));
+    recording.stop()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_recording_that_is_played_back_is_estimated_to_the_same_bits() {
+    let (first, second) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let go = AtomicBool::new(false);
+    let original = recorded(first.path(), move |bus| {
+        let config = config();
+        let source = |seed| Source::synthetic(&config, seed).unwrap();
+        let mut beds = [Bed::new("bed1", source(1)), Bed::new("bed2", source(2))];
+        let options = ReplayOptions { seconds: Some(3.0), speed: 4.0, ..ReplayOptions::default() };
+        run(bus, &config, &options, &mut beds, &go).unwrap();
+    })
+    .await;
+    assert_eq!((original.beds, original.dropped, original.refused.len()), (2, 0, 0));
+    assert!(original.rows["estimates"] >= 2 * 140, "{:?}", original.rows);
+
+    let directory = first.path().to_owned();
+    let counted = Arc::new(Mutex::new(0.0));
+    let seconds = Arc::clone(&counted);
+    let again = recorded(second.path(), move |bus| {
+        let mut playback = Playback::open(&directory, &[], "hemostream").unwrap();
+        assert_eq!(playback.beds(), ["bed1", "bed2"]);
+        let go = AtomicBool::new(false);
+        *seconds.lock().unwrap() = play(bus, &mut playback, 4.0, None, &go, &mut |_| {}).unwrap().seconds;
+    })
+    .await;
+    assert_eq!((again.beds, again.dropped), (2, 0));
+    let seconds = *counted.lock().unwrap();
+    assert!((0.6..10.0).contains(&seconds), "arrivals of 3 s at four times the speed: {seconds} s");
+
+    for bed in ["bed1", "bed2"] {
+        for table in ["estimates", "parameters", "beats", "samples", "truth"] {
+            let (a, b) = (rows(first.path(), table, bed, &["arrival"]), rows(second.path(), table, bed, &["arrival"]));
+            println!("{bed} {table}: {} rows", a.len());
+            assert!(!a.is_empty(), "{bed} {table}");
+            assert!(a == b, "{bed} {table}");
+        }
+    }
+    let headers = |m: &Message| m.key.clone();
+    let (a, b) = (played(first.path(), &[]), played(second.path(), &[]));
+    assert!(a.iter().map(|(_, m)| headers(m)).eq(b.iter().map(|(_, m)| headers(m))), "all beds in one order");
+}
+
+#[test]
+fn a_disk_that_does_not_take_it_ends_the_recording_with_what_is_wrong() {
+    let directory = tempfile::tempdir().unwrap();
+    // A file where the folder of a table should be.
+    std::fs::write(directory.path().join("samples"), "").unwrap();
+    let bus = MemoryBus::new();
+    let stop = AtomicBool::new(false);
+    let ended = std::thread::scope(|scope| {
+        let recording = scope.spawn(|| {
+            let quick = RecordOptions { flush_s: 0.01, ..options() };
+            recorder::run(&bus, directory.path(), quick, Units::default(), &stop, &mut |_, _| {})
+        });
+        while !bus.is_wanted("hemostream/icu/alarm") && !recording.is_finished() {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        bus.publish(message("icu", "pressure/p_a", &block(0, 0, &[1.0])), Delivery::Samples).unwrap();
+        recording.join().unwrap()
+    });
+    let error = ended.unwrap_err().to_string();
+    assert!(error.starts_with("recording: ") && error.contains("samples"), "{error}");
+}

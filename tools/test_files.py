@@ -1,0 +1,263 @@
+"""Tests of the files of hemostream with the tools that others read them with: pandas, DuckDB, the package `wfdb`.
+
+They need the program: the environment variable HEMOSTREAM, or `target/debug/hemostream`. Without it they are passed
+over, unless HEMOSTREAM_REQUIRED is 1.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import tempfile
+import time
+import unittest
+from pathlib import Path
+
+import duckdb
+import numpy as np
+import pandas as pd
+import plot_recording
+import pyarrow.parquet as pq
+import wfdb
+
+ROOT = Path(__file__).resolve().parent.parent
+PROGRAM = Path(os.environ.get("HEMOSTREAM", ROOT / "target" / "debug" / "hemostream"))
+REQUIRED = os.environ.get("HEMOSTREAM_REQUIRED") == "1"
+
+# The rest of what begins so would be settings.
+ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith("HEMOSTREAM")}
+
+PATIENCE_S = 60.0
+"""Bounds a wait on a process that does not do what it should."""
+
+SETTINGS = [
+    "observed=['p_a', 'p_pa']",
+    "estimator.members=8",
+    "window.length_s=0.005",
+    "publish.rate_hz=50",
+]
+
+
+def settings(*more: str) -> list[str]:
+    return [word for setting in [*SETTINGS, *more] for word in ("--set", setting)]
+
+
+class WithProgram(unittest.TestCase):
+    folder: Path
+
+    def setUp(self) -> None:
+        if not PROGRAM.is_file():
+            reason = f"{PROGRAM} is not there: `cargo build`, or set HEMOSTREAM"
+            if REQUIRED:
+                self.fail(reason)
+            self.skipTest(reason)
+        temporary = tempfile.TemporaryDirectory()
+        self.addCleanup(temporary.cleanup)
+        self.folder = Path(temporary.name)
+
+    def run_program(self, *arguments: str) -> str:
+        done = subprocess.run(
+            [PROGRAM, *arguments], env=ENVIRONMENT, cwd=self.folder, capture_output=True, text=True, timeout=PATIENCE_S
+        )
+        self.assertEqual(done.returncode, 0, done.stderr)
+        return done.stdout
+
+    def start(self, *arguments: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [PROGRAM, *arguments],
+            env=ENVIRONMENT,
+            cwd=self.folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+        def end() -> None:
+            if process.poll() is None:
+                process.kill()
+            process.communicate()
+
+        self.addCleanup(end)
+        return process
+
+    def stop(self, process: subprocess.Popen[str]) -> str:
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=PATIENCE_S)
+        self.assertEqual(process.returncode, 0, said)
+        return said
+
+
+class Records(WithProgram):
+    def test_csv_to_parquet_to_wfdb_to_csv(self) -> None:
+        rng = np.random.default_rng(5)
+        n, rate = 3000, 250
+        times = 7.5 + np.arange(n) / rate
+        values = np.column_stack([rng.uniform(-20, 240, n), rng.uniform(100, 1200, n)])
+        values[rng.integers(0, n, 40), rng.integers(0, 2, 40)] = np.nan
+        frame = pd.DataFrame({"time_s": times, "ABP": values[:, 0], "PAP": values[:, 1]})
+        frame.to_csv(self.folder / "a.csv", index=False)
+        self.run_program("convert", "a.csv", "b.parquet")
+        self.run_program("convert", "b.parquet", "c.hea", "--label", "p_a=ABP", "--label", "p_pa=PAP")
+        self.run_program("convert", "c.hea", "d.csv")
+
+        parquet = pd.read_parquet(self.folder / "b.parquet")
+        np.testing.assert_array_equal(parquet.to_numpy(), np.column_stack([times, values]))
+        metadata = pq.read_metadata(self.folder / "b.parquet").metadata
+        self.assertEqual(metadata[b"hemostream.schema"], b"1")
+        self.assertEqual(json.loads(metadata[b"hemostream.units"]), {"time_s": "s", "p_a": "mmHg", "p_pa": "mmHg"})
+        first = duckdb.sql(f"select min(time_s), count(p_a) from '{self.folder / 'b.parquet'}'").fetchone()
+        self.assertEqual(first, (7.5, int(np.isfinite(values[:, 0]).sum())))
+
+        record = wfdb.rdrecord(str(self.folder / "c"))
+        self.assertEqual((record.fs, record.sig_name, record.units), (rate, ["ABP", "PAP"], ["mmHg", "mmHg"]))
+        self.assertEqual((record.adc_gain[0], record.baseline[0]), (100.0, 0))
+        self.assertLess(record.adc_gain[1], 100.0)
+        self.assertIn("hemostream_start_ns: 7500000000", record.comments)
+        steps = 1 / np.asarray(record.adc_gain)
+        np.testing.assert_array_equal(np.isnan(record.p_signal), np.isnan(values))
+        self.assertTrue(np.all(np.nan_to_num(np.abs(record.p_signal - values)) <= 0.5 * steps * (1 + 1e-9)))
+
+        back = pd.read_csv(self.folder / "d.csv")
+        self.assertEqual(list(back.columns), ["time_s", "p_a", "p_pa"])
+        np.testing.assert_allclose(back["time_s"], times, rtol=0, atol=2e-9)
+        np.testing.assert_allclose(back.to_numpy()[:, 1:], record.p_signal, rtol=0, atol=1e-9)
+
+    def test_parquet_of_pandas_and_duckdb_is_read(self) -> None:
+        frame = pd.DataFrame({"time_s": np.arange(100) / 125, "ABP": 80 + np.arange(100) / 7})
+        frame.to_parquet(self.folder / "pandas.parquet")
+        duckdb.sql(f"copy frame to '{self.folder / 'duckdb.parquet'}' (format parquet)")
+        for name in ("pandas", "duckdb"):
+            with self.subTest(name=name):
+                self.run_program("convert", f"{name}.parquet", f"{name}.csv")
+                back = pd.read_csv(self.folder / f"{name}.csv", float_precision="round_trip")
+                np.testing.assert_array_equal(back.to_numpy(), frame.to_numpy())
+
+
+def free_port() -> int:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return int(taken.getsockname()[1])
+
+
+class Recordings(WithProgram):
+    def setUp(self) -> None:
+        super().setUp()
+        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
+        self.recording = self.folder / "recording"
+        self.daemon = self.start("serve", *settings(f"zenoh.listen=['{self.endpoint}']"))
+        self.wait_for_daemon()
+
+    def wait_for_daemon(self) -> None:
+        address, port = self.endpoint.removeprefix("tcp/").split(":")
+        until = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until:
+            try:
+                socket.create_connection((address, int(port)), timeout=1).close()
+                return
+            except OSError:
+                time.sleep(0.05)
+        self.fail("the daemon does not listen")
+
+    def record(self, *more: str) -> subprocess.Popen[str]:
+        recorder = self.start(
+            "record", "--output", "recording", "--connect", self.endpoint, "--flush-s", "0.3", *more, *settings()
+        )
+        until = time.monotonic() + PATIENCE_S
+        while not (self.recording / ".lock").exists():
+            self.assertLess(time.monotonic(), until, "the recorder does not begin")
+            time.sleep(0.02)
+        # The subscription takes a moment to get to the daemon and on to the publisher.
+        time.sleep(0.5)
+        return recorder
+
+    def replay(self, *arguments: str) -> str:
+        return self.run_program("replay", "--connect", self.endpoint, *arguments, *settings())
+
+    def rows(self, table: str) -> int:
+        folder = self.recording / table
+        return len(pd.read_parquet(folder)) if folder.is_dir() else 0
+
+    def wait_for(self, table: str, rows: int) -> None:
+        until = time.monotonic() + PATIENCE_S
+        while self.rows(table) < rows:
+            self.assertLess(time.monotonic(), until, f"{self.rows(table)} rows in {table}, expected {rows}")
+            time.sleep(0.1)
+
+    def test_pandas_and_duckdb_read_what_is_recorded_and_plotted(self) -> None:
+        recorder = self.record()
+        self.replay("--seconds", "3", "--speed", "2", "--beds", "2", "--bed", "icu")
+        self.wait_for("estimates", 2 * 140)
+        said = self.stop(recorder)
+        self.assertIn("beds: 2", said)
+        self.assertIn("messages dropped: 0", said)
+
+        samples = pd.read_parquet(self.recording / "samples")
+        self.assertEqual(set(samples["bed"].unique()), {"icu-1", "icu-2"})
+        self.assertEqual(str(samples["arrival"].dtype), "datetime64[ns, UTC]")
+        self.assertLess(abs(time.time() - samples["arrival"].max().timestamp()), PATIENCE_S)
+        by_channel = samples.dropna().groupby(["bed", "channel"], observed=True).size()
+        self.assertEqual(set(by_channel), {601})
+        names = "arrival, channel, sequence, flags, time_ns, value, bed, hour".split(", ")
+        self.assertEqual(list(samples.columns), names)
+
+        pattern = self.recording / "estimates" / "**" / "*.parquet"
+        query = "select bed, count(*), min(time_ns), bool_and(p_l_q05 <= p_l_mean), min(typeof(sequence)) from "
+        query += f"read_parquet('{pattern}', hive_partitioning = true) group by bed order by bed"
+        for bed, count, first, ordered, kind in duckdb.sql(query).fetchall():
+            self.assertIn(bed, ("icu-1", "icu-2"))
+            self.assertGreaterEqual(count, 140)
+            self.assertEqual((first, ordered, kind), (0, True, "UBIGINT"))
+        events = pd.read_parquet(self.recording / "events")
+        self.assertIn("start", set(events["kind"]))
+        status = pd.read_parquet(self.recording / "status")
+        channels = json.loads(status["channels"].iloc[-1])
+        self.assertEqual([channel["name"] for channel in channels], ["p_a", "p_pa"])
+
+        picture = self.folder / "p.png"
+        arguments = [str(self.recording), "--bed", "icu-2", "--output", str(picture)]
+        self.assertEqual(plot_recording.main([*arguments, "p_a", "p_l", "r_pv"]), plot_recording.OK)
+        self.assertTrue(picture.read_bytes().startswith(b"\x89PNG"))
+        self.assertEqual(plot_recording.main([*arguments, "nothing"]), plot_recording.USAGE)
+
+    def test_what_is_on_the_disk_outlives_a_kill_and_recording_goes_on(self) -> None:
+        recorder = self.record()
+        publisher = self.start("replay", "--connect", self.endpoint, "--seconds", "60", *settings())
+        self.wait_for("samples", 100)
+        # Past a merge, and in the middle of whatever is done then.
+        time.sleep(12.0)
+        recorder.kill()
+        killed = time.time()
+        recorder.wait(PATIENCE_S)
+        before = pd.read_parquet(self.recording / "samples")
+        newest = before["arrival"].max().timestamp()
+        self.assertLess(killed - newest, 3.0)
+        for table in ("estimates", "parameters", "status", "events"):
+            self.assertGreater(self.rows(table), 0, table)
+        recorder = self.record()
+        self.wait_for("samples", len(before) + 100)
+        publisher.kill()
+        self.stop(recorder)
+        after = pd.read_parquet(self.recording / "samples")
+        keys = ["arrival", "channel", "time_ns"]
+        self.assertFalse(after.duplicated(keys).any(), "nothing twice")
+        kept = after.merge(before[keys].drop_duplicates(), on=keys)
+        self.assertEqual(len(kept), len(before.drop_duplicates(keys)), "nothing lost")
+        self.assertEqual(list(self.recording.rglob("*.tmp")), [])
+
+    def test_a_recording_is_played_back(self) -> None:
+        recorder = self.record()
+        self.replay("--seconds", "2", "--speed", "2")
+        self.wait_for("estimates", 90)
+        self.stop(recorder)
+        said = self.replay("--recording", "recording", "--speed", "4")
+        self.assertIn("playing bed1 under hemostream/", said)
+        blocks = pd.read_parquet(self.recording / "samples")["arrival"].nunique()
+        truths = pd.read_parquet(self.recording / "truth")["arrival"].nunique()
+        self.assertIn(f"published {blocks + truths} messages of ", said)
+
+
+if __name__ == "__main__":
+    unittest.main()
