@@ -31,6 +31,14 @@ export function range(low, high, digits) {
   return number(low, digits) + (low < 0 ? " to " : "–") + number(high, digits);
 }
 
+/** A band around a number that is shown with so many digits; where both edges would read the same it is told by its half
+ * width (`±0.3`), and there is nothing to tell where there is none. */
+export function spread(low, high, digits) {
+  const both = range(low, high, digits);
+  if (both === NONE || number(low, digits) !== number(high, digits)) return both;
+  return high > low ? `±${Number(((high - low) / 2).toPrecision(1))}` : "";
+}
+
 /** A duration [s] in a few characters. */
 export function duration(seconds) {
   if (!isNumber(seconds)) return NONE;

@@ -1,7 +1,7 @@
 // Trends over minutes: estimated parameters, and what each beat amounts to. A small chart for each.
 
 import { byId, element, setAttribute, setText } from "./dom.js";
-import { BEAT_NAMES, describe } from "./names.js";
+import { describeBeat, describeParameter } from "./names.js";
 import { decimals, duration, NONE, number, range } from "./numbers.js";
 import { trendFigure } from "./trendfigure.js";
 
@@ -61,7 +61,7 @@ class TrendCard {
     this.kind = kind;
     this.name = name;
     this.isParameter = kind === "parameters";
-    const about = this.isParameter ? { label: name, text: name, color: "hue-parameter" } : beatAbout(name);
+    const about = this.isParameter ? describeParameter(name) : describeBeat(name);
     this.hue = about.color;
     this.value = element("span", { class: "trend-value" });
     this.band = element("span", { class: "trend-band" });
@@ -86,13 +86,6 @@ class TrendCard {
     setText(this.state, this.isParameter ? informedText(history, this.name, at("informed")) : "");
     setAttribute(this.node, "data-informed", String(!this.isParameter || at("informed") >= 0.5));
   }
-}
-
-function beatAbout(name) {
-  if (Object.hasOwn(BEAT_NAMES, name)) return BEAT_NAMES[name];
-  const [, quantity, part] = /^(.*)_(systolic|diastolic|mean)$/.exec(name);
-  const about = describe(quantity);
-  return { label: `${about.label} ${part}`, text: `${part} ${about.text}`, color: about.color };
 }
 
 function informedText(history, name, informed) {
