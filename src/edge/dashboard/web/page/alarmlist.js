@@ -66,7 +66,8 @@ export class AlarmList {
 function detail(alarm) {
   const digits = decimals(alarm.mean, (alarm.high - alarm.low) / 2);
   const limit = `${labelOf(alarm.quantity)} ${alarm.side === "below" ? "<" : ">"} ${alarm.limit} ${alarm.unit}`;
-  const band = alarm.mean == null ? "" : `, is ${number(alarm.mean, digits)} (${range(alarm.low, alarm.high, digits)})`;
-  const since = isRaised(alarm) ? `, since ${clockText(secondsOf(alarm.since_ns))}` : "";
-  return `${limit}${band}${since}`;
+  // The band is of the moment when the alarm became what it is; what it is by now stands elsewhere.
+  const band = alarm.mean == null ? "" : `: ${number(alarm.mean, digits)} (${range(alarm.low, alarm.high, digits)})`;
+  const when = isRaised(alarm) ? ` at ${clockText(secondsOf(alarm.since_ns))}` : "";
+  return `${limit}${band}${when}`;
 }

@@ -1,7 +1,7 @@
 // Readings of a beat as a bedside writes them: a number or `sys/dia (mean)`, and the band under it.
 
 import { BEAT_NAMES, describe } from "./names.js";
-import { NONE, number, spread } from "./numbers.js";
+import { halfWidth, NONE, number, range, spread } from "./numbers.js";
 
 /** Systolic, diastolic and mean value with their bands of one pressure; `at` gives a clinical quantity by its key. */
 export function pressureReading(name, at) {
@@ -21,7 +21,11 @@ export function pressureReading(name, at) {
 function arranged(name, isKnown, bands) {
   if (!isKnown) return { main: NONE, side: "", band: NONE };
   const [systolic, diastolic, mean] = bands.map((of) => number(of?.mean, 0));
-  const [ofSystolic, ofDiastolic, ofMean] = bands.map((of) => spread(of?.low, of?.high, 0));
+  // All three in the same way, or they would be hard to compare.
+  const asHalf = bands.some((of) => of && of.high - of.low < 1);
+  const [ofSystolic, ofDiastolic, ofMean] = bands.map((of) =>
+    asHalf ? halfWidth(of?.low, of?.high) : range(of?.low, of?.high, 0),
+  );
   if (name === "p_v" || name === "p_pv") {
     return { main: mean, side: `(${systolic}/${diastolic})`, band: `${ofMean} (${ofSystolic} / ${ofDiastolic})` };
   }

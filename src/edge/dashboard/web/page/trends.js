@@ -2,7 +2,7 @@
 
 import { byId, element, setAttribute, setText } from "./dom.js";
 import { describeBeat, describeParameter } from "./names.js";
-import { decimals, duration, NONE, number, range } from "./numbers.js";
+import { decimals, duration, NONE, number, spread } from "./numbers.js";
 import { trendFigure } from "./trendfigure.js";
 
 const BEAT_TRENDS = [
@@ -82,7 +82,7 @@ class TrendCard {
     const at = (part) => (row < 0 ? NaN : (series.column(part)?.[row] ?? NaN));
     const digits = decimals(at("mean"), (at("high") - at("low")) / 2);
     setText(this.value, number(at("mean"), digits));
-    setText(this.band, row < 0 ? NONE : `${range(at("low"), at("high"), digits)} ${history.units.get(this.name) ?? ""}`);
+    setText(this.band, row < 0 ? NONE : `${spread(at("low"), at("high"), digits)} ${history.units.get(this.name) ?? ""}`);
     setText(this.state, this.isParameter ? informedText(history, this.name, at("informed")) : "");
     setAttribute(this.node, "data-informed", String(!this.isParameter || at("informed") >= 0.5));
   }
