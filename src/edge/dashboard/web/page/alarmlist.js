@@ -2,6 +2,7 @@
 
 import { byUrgency, isRaised, signOf } from "./alarms.js";
 import { byId, element, setAttribute, setText } from "./dom.js";
+import { labelOf } from "./names.js";
 import { decimals, number, range } from "./numbers.js";
 import { clockText, secondsOf } from "./time.js";
 
@@ -46,7 +47,7 @@ export class AlarmList {
     item.append(
       element("span", { class: "alarm-sign", text: sign, title: `${alarm.priority} priority` }),
       element("span", { class: "alarm-what" }, what, " ", element("span", { class: "alarm-state", text: state })),
-      element("span", { class: "alarm-text", text: detail(alarm) }),
+      element("span", { class: "alarm-text", text: detail(alarm), title: alarm.quantity }),
     );
     if (isRaised(alarm) && !alarm.acknowledged) item.append(this.#button(alarm.name));
     return item;
@@ -64,8 +65,9 @@ export class AlarmList {
 
 function detail(alarm) {
   const digits = decimals(alarm.mean, (alarm.high - alarm.low) / 2);
-  const limit = `${alarm.quantity} ${alarm.side === "below" ? "<" : ">"} ${alarm.limit} ${alarm.unit}`;
-  const band = alarm.mean == null ? "" : `, is ${number(alarm.mean, digits)} (${range(alarm.low, alarm.high, digits)})`;
-  const since = isRaised(alarm) ? `, since ${clockText(secondsOf(alarm.since_ns))}` : "";
-  return `${limit}${band}${since}`;
+  const limit = `${labelOf(alarm.quantity)} ${alarm.side === "below" ? "<" : ">"} ${alarm.limit} ${alarm.unit}`;
+  // The band is of the moment when the alarm became what it is; what it is by now stands elsewhere.
+  const band = alarm.mean == null ? "" : `: ${number(alarm.mean, digits)} (${range(alarm.low, alarm.high, digits)})`;
+  const when = isRaised(alarm) ? ` at ${clockText(secondsOf(alarm.since_ns))}` : "";
+  return `${limit}${band}${when}`;
 }

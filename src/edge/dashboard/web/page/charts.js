@@ -75,7 +75,9 @@ export class Charts {
     const begin = performance.now();
     draw(Plotly, chart);
     const end = performance.now();
-    this.restUntil = end + REST * (end - begin);
+    // A chart that was never drawn is an empty frame; the strips can wait for these few.
+    const isBlank = [...this.charts].some((c) => c.node.isInSight && !c.isDrawn && c.drawnAt === -Infinity);
+    this.restUntil = isBlank ? 0 : end + REST * (end - begin);
   }
 }
 

@@ -1,6 +1,7 @@
 // The event log, newest first, and the field for a note.
 
 import { byId, element, recall, remember, setText } from "./dom.js";
+import { eventLabel } from "./names.js";
 import { clockText } from "./time.js";
 
 const SHOWN_LIMIT = 200;
@@ -45,7 +46,7 @@ export class EventLog {
 }
 
 function itemOf(event) {
-  const what = event.kind === "note" ? "✎ note" : `${event.kind} ${event.channel ?? ""}`.trim();
+  const what = event.kind === "note" ? "✎ note" : eventLabel(event);
   return element(
     "li",
     { "data-kind": kindOf(event) },

@@ -1,6 +1,7 @@
 // How the estimator is doing: members, lag, work, what was refused, and every channel.
 
 import { byId, element, setText } from "./dom.js";
+import { describe } from "./names.js";
 import { count, NONE, number } from "./numbers.js";
 
 const CHANNELS_LIMIT = 12;
@@ -34,7 +35,7 @@ function writeChannels(channels) {
   const rows = channels.slice(0, CHANNELS_LIMIT).map((channel) => {
     const fits = !channel.misfit && !(channel.innovation_rms > MISFIT);
     const remark = channel.artefact ? `✕ ${channel.artefact}` : fits ? "✓ fits" : "△ model does not fit";
-    const cells = [channel.name, channel.state, number(channel.noise_sd, 2), number(channel.innovation_rms, 2), remark];
+    const cells = [describe(channel.name).label, channel.state, number(channel.noise_sd, 2), number(channel.innovation_rms, 2), remark];
     const isBad = Boolean(channel.artefact) || !fits || channel.state !== "live";
     return element("tr", { "data-bad": String(isBad) }, ...cells.map((text) => element("td", { text })));
   });

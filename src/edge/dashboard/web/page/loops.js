@@ -100,8 +100,8 @@ function figureOf(points, { volume, pressure, hue }) {
   };
   const layout = {
     margin: { l: 42, r: 8, t: 6, b: 36 },
-    xaxis: axis({ title: { text: `${volume} [mL]`, standoff: 4 }, nticks: 5 }),
-    yaxis: axis({ title: { text: `${pressure} [mmHg]`, standoff: 4 }, nticks: 5 }),
+    xaxis: axis({ title: { text: "volume [mL]", standoff: 4 }, nticks: 5 }),
+    yaxis: axis({ title: { text: "pressure [mmHg]", standoff: 4 }, nticks: 5 }),
   };
   return { data: [band, mean, dot], layout };
 }

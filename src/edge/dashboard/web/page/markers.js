@@ -1,6 +1,7 @@
 // What happened, as marks on the timeline of strips and trends: notes, alarms, everything else that an event told.
 
 import { isRaised, signOf } from "./alarms.js";
+import { eventLabel } from "./names.js";
 import { secondsOf } from "./time.js";
 
 const LABEL_LENGTH = 28;
@@ -11,7 +12,7 @@ const short = (text) => (text.length > LABEL_LENGTH ? `${text.slice(0, LABEL_LEN
 export function markersOf(history) {
   const events = history.events.filter((event) => event.time !== null).map((event) => {
     const isNote = event.kind === "note";
-    const label = isNote ? `✎ ${event.text}` : `${event.kind} ${event.channel ?? ""}`.trim();
+    const label = isNote ? `✎ ${event.text}` : eventLabel(event);
     return { time: event.time, kind: isNote ? "note" : "event", label: short(label) };
   });
   const alarms = (history.latest.alarms ?? []).filter(isRaised).map((alarm) => {

@@ -31,6 +31,18 @@ export function range(low, high, digits) {
   return number(low, digits) + (low < 0 ? " to " : "–") + number(high, digits);
 }
 
+/** A band under a number that is shown with so many digits: `71–73`; where it is narrower than the last of them its half
+ * width, `±0.3`; nothing where it has no width. */
+export function spread(low, high, digits) {
+  return high - low < 10 ** -digits ? halfWidth(low, high) : range(low, high, digits);
+}
+
+/** Half the width of a band: `±0.3`; nothing where it has none. */
+export function halfWidth(low, high) {
+  if (!isNumber(low) || !isNumber(high)) return NONE;
+  return high > low ? `±${Number(((high - low) / 2).toPrecision(1))}` : "";
+}
+
 /** A duration [s] in a few characters. */
 export function duration(seconds) {
   if (!isNumber(seconds)) return NONE;

@@ -8,7 +8,9 @@ import { shareInside } from "./truth.js";
 /** Room at the left for the numbers of the scale [px]. */
 const AXIS_WIDTH = 38;
 
-const LABEL_ROWS = 3;
+/** A mark speaks for those that follow it so closely [px]. */
+const CLUSTER_PX = 60;
+const URGENCY = { high: 4, medium: 3, low: 2, note: 1 };
 const FONT = "11px system-ui, sans-serif";
 
 /** Where on the canvas a time and a value are. */
@@ -36,6 +38,7 @@ export function paintStrip(ctx, history, name, picture) {
   const samples = () => (picture.showSamples ? paintSamples(ctx, at, history.samples.get(name), picture) : 0);
   const account = paintEstimate(ctx, at, history.estimate, name, picture, samples);
   account.truthInside = picture.showTruth ? paintTruth(ctx, at, history, name, picture) : null;
+  if (picture.withLabels) paintLabels(ctx, at, picture);
   ctx.restore();
   return { ...account, left, right };
 }
@@ -66,10 +69,7 @@ function paintGrid(ctx, at, { width, height, left, right, scale, palette }) {
 /** Seconds between two vertical lines of a strip. */
 export const secondsPerLine = (span) => (span <= 2 ? 0.2 : span <= 5 ? 0.5 : span <= 10 ? 1 : span <= 30 ? 2 : 5);
 
-function paintMarkers(ctx, at, { height, markers, withLabels, palette }) {
-  ctx.font = FONT;
-  ctx.textAlign = "left";
-  ctx.textBaseline = "top";
+function paintMarkers(ctx, at, { height, markers, palette }) {
   for (const marker of markers) {
     const x = Math.round(at.x(marker.time)) + 0.5;
     ctx.strokeStyle = palette.marker[marker.kind] ?? palette.quiet;
@@ -81,23 +81,46 @@ function paintMarkers(ctx, at, { height, markers, withLabels, palette }) {
     ctx.stroke();
     ctx.setLineDash([]);
   }
-  if (withLabels) paintLabels(ctx, at, markers, palette);
 }
 
-// Labels of marks close to each other go below each other; where that is not enough room, the mark alone has to do.
-function paintLabels(ctx, at, markers, palette) {
-  const ends = new Array(LABEL_ROWS).fill(-Infinity);
-  for (const marker of [...markers].sort((one, other) => one.time - other.time)) {
-    const x = at.x(marker.time) + 4;
-    const row = ends.findIndex((end) => end < x);
-    if (row < 0) continue;
-    const width = ctx.measureText(marker.label).width;
-    ends[row] = x + width + 6;
+// One line of labels, so that the waveform stays readable: of marks close to each other the most urgent is named, the
+// others are counted, and each label is cut off where the next one begins.
+function paintLabels(ctx, at, { markers, palette }) {
+  ctx.font = FONT;
+  ctx.textAlign = "left";
+  ctx.textBaseline = "top";
+  const clusters = clustersOf(at, markers);
+  clusters.forEach(({ x, first, others }, k) => {
+    const room = (clusters[k + 1]?.x ?? Infinity) - x - 8;
+    const text = shortened(ctx, first.label, others ? ` +${others}` : "", room);
     ctx.fillStyle = palette.plate;
-    ctx.fillRect(x - 2, 2 + 14 * row, width + 4, 13);
+    ctx.fillRect(x + 2, 2, ctx.measureText(text).width + 4, 13);
     ctx.fillStyle = palette.ink;
-    ctx.fillText(marker.label, x, 3 + 14 * row);
+    ctx.fillText(text, x + 4, 3);
+  });
+}
+
+function clustersOf(at, markers) {
+  const urgency = (marker) => URGENCY[marker.kind] ?? 0;
+  const clusters = [];
+  for (const marker of [...markers].sort((one, other) => one.time - other.time)) {
+    const x = at.x(marker.time);
+    const last = clusters[clusters.length - 1];
+    if (!last || x - last.x > CLUSTER_PX) {
+      clusters.push({ x, first: marker, others: 0 });
+      continue;
+    }
+    last.others += 1;
+    if (urgency(marker) > urgency(last.first)) last.first = marker;
   }
+  return clusters;
+}
+
+function shortened(ctx, label, ending, room) {
+  if (ctx.measureText(label + ending).width <= room) return label + ending;
+  let length = label.length - 1;
+  while (length > 1 && ctx.measureText(`${label.slice(0, length)}…${ending}`).width > room) length -= 1;
+  return `${label.slice(0, length).trimEnd()}…${ending}`;
 }
 
 // Samples lie between band and mean: they hide neither.

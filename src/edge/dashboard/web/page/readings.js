@@ -1,7 +1,7 @@
 // Readings of a beat as a bedside writes them: a number or `sys/dia (mean)`, and the band under it.
 
 import { BEAT_NAMES, describe } from "./names.js";
-import { NONE, number, range } from "./numbers.js";
+import { halfWidth, NONE, number, range, spread } from "./numbers.js";
 
 /** Systolic, diastolic and mean value with their bands of one pressure; `at` gives a clinical quantity by its key. */
 export function pressureReading(name, at) {
@@ -21,7 +21,11 @@ export function pressureReading(name, at) {
 function arranged(name, isKnown, bands) {
   if (!isKnown) return { main: NONE, side: "", band: NONE };
   const [systolic, diastolic, mean] = bands.map((of) => number(of?.mean, 0));
-  const [ofSystolic, ofDiastolic, ofMean] = bands.map((of) => range(of?.low, of?.high, 0));
+  // All three in the same way, or they would be hard to compare.
+  const asHalf = bands.some((of) => of && of.high - of.low < 1);
+  const [ofSystolic, ofDiastolic, ofMean] = bands.map((of) =>
+    asHalf ? halfWidth(of?.low, of?.high) : range(of?.low, of?.high, 0),
+  );
   if (name === "p_v" || name === "p_pv") {
     return { main: mean, side: `(${systolic}/${diastolic})`, band: `${ofMean} (${ofSystolic} / ${ofDiastolic})` };
   }
@@ -40,7 +44,7 @@ export function singleReading(name, at) {
     main: number(band?.mean, digits),
     side: "",
     // Where the band is narrower than the last digit shown it needs another one to be seen as a band.
-    band: band ? range(band.low, band.high, band.high - band.low < 10 ** -digits ? digits + 1 : digits) : NONE,
+    band: band ? spread(band.low, band.high, band.high - band.low < 10 ** -digits ? digits + 1 : digits) : NONE,
     note: band && (name === "svr" || name === "pvr") ? woodUnits(band.mean) : "",
   };
 }

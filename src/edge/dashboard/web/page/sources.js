@@ -32,7 +32,7 @@ export class Sources {
     const parts = SOURCES.map((source) => element("span", { class: `share share-${source}` }));
     const bar = element("div", { class: "bar", role: "img" }, ...parts);
     const sd = element("span", { class: "source-sd" });
-    const label = element("span", { class: "source-name", text: name, title: about.text });
+    const label = element("span", { class: "source-name", text: about.label, title: `${about.text} (${name})` });
     this.body.append(element("div", { class: "source" }, label, bar, sd));
     return { parts, bar, sd };
   }

@@ -2,7 +2,7 @@
 
 import { element, setAttribute, setText } from "./dom.js";
 import { describe } from "./names.js";
-import { decimals, NONE, number, range } from "./numbers.js";
+import { decimals, NONE, number, spread } from "./numbers.js";
 import { paintStrip } from "./paint.js";
 import { paletteOf } from "./palette.js";
 import { pressureReading } from "./readings.js";
@@ -84,7 +84,7 @@ export class Strip {
     const at = (part) => (row < 0 ? null : estimate.column(`${this.name}.${part}`)[row]);
     const [low, high] = [at("low"), at("high")];
     const digits = this.isPressure ? 0 : Math.min(decimals(at("mean"), (high - low) / 2), 1);
-    const instant = `${number(at("mean"), digits)}  ${range(low, high, digits)} ${this.about.unit}`;
+    const instant = `${number(at("mean"), digits)}  ${spread(low, high, digits)} ${this.about.unit}`;
     setText(this.origin, Object.hasOwn(ORIGINS, origin) ? ORIGINS[origin] : "");
     setAttribute(this.origin, "data-origin", origin ?? "");
     if (!isCurrent) {
@@ -98,7 +98,7 @@ export class Strip {
       setAttribute(this.canvas, "aria-label", `${this.about.text}: ${reading.main} ${reading.side} mmHg`);
     } else {
       setText(this.main, number(at("mean"), digits));
-      setText(this.instant, row < 0 ? NONE : `${range(low, high, digits)} ${this.about.unit}`);
+      setText(this.instant, row < 0 ? NONE : `${spread(low, high, digits)} ${this.about.unit}`);
       setAttribute(this.canvas, "aria-label", `${this.about.text}: ${instant}`);
     }
   }

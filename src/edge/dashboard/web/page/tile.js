@@ -15,7 +15,7 @@ const CELLS = [
   { of: (at) => singleReading("pvr", at), size: "small" },
 ];
 
-const ALARMS_SHOWN = 2;
+const ALARMS_SHOWN = 1;
 
 export class Tile {
   constructor(name) {
@@ -66,7 +66,7 @@ export class Tile {
     setAttribute(this.link, "data-unseen", String(unseen));
     const more = raised.length - ALARMS_SHOWN;
     this.alarms.replaceChildren(...raised.slice(0, ALARMS_SHOWN).map(badge));
-    if (more > 0) this.alarms.append(element("span", { class: "quiet", text: `+${more}` }));
+    if (more > 0) this.alarms.append(element("span", { class: "alarm-more", text: `+${more}`, title: alarmWords(raised.slice(ALARMS_SHOWN)) }));
   }
 }
 

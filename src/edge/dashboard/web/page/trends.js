@@ -1,8 +1,8 @@
 // Trends over minutes: estimated parameters, and what each beat amounts to. A small chart for each.
 
 import { byId, element, setAttribute, setText } from "./dom.js";
-import { BEAT_NAMES, describe } from "./names.js";
-import { decimals, duration, NONE, number, range } from "./numbers.js";
+import { describeBeat, describeParameter } from "./names.js";
+import { decimals, duration, NONE, number, spread } from "./numbers.js";
 import { trendFigure } from "./trendfigure.js";
 
 const BEAT_TRENDS = [
@@ -61,7 +61,7 @@ class TrendCard {
     this.kind = kind;
     this.name = name;
     this.isParameter = kind === "parameters";
-    const about = this.isParameter ? { label: name, text: name, color: "hue-parameter" } : beatAbout(name);
+    const about = this.isParameter ? describeParameter(name) : describeBeat(name);
     this.hue = about.color;
     this.value = element("span", { class: "trend-value" });
     this.band = element("span", { class: "trend-band" });
@@ -82,17 +82,10 @@ class TrendCard {
     const at = (part) => (row < 0 ? NaN : (series.column(part)?.[row] ?? NaN));
     const digits = decimals(at("mean"), (at("high") - at("low")) / 2);
     setText(this.value, number(at("mean"), digits));
-    setText(this.band, row < 0 ? NONE : `${range(at("low"), at("high"), digits)} ${history.units.get(this.name) ?? ""}`);
+    setText(this.band, row < 0 ? NONE : `${spread(at("low"), at("high"), digits)} ${history.units.get(this.name) ?? ""}`);
     setText(this.state, this.isParameter ? informedText(history, this.name, at("informed")) : "");
     setAttribute(this.node, "data-informed", String(!this.isParameter || at("informed") >= 0.5));
   }
-}
-
-function beatAbout(name) {
-  if (Object.hasOwn(BEAT_NAMES, name)) return BEAT_NAMES[name];
-  const [, quantity, part] = /^(.*)_(systolic|diastolic|mean)$/.exec(name);
-  const about = describe(quantity);
-  return { label: `${about.label} ${part}`, text: `${part} ${about.text}`, color: about.color };
 }
 
 function informedText(history, name, informed) {
