@@ -111,11 +111,7 @@ fn draw_alarm(buf: &mut Buffer, area: Rect, row: u16, alarm: &Alarm, now_ns: Opt
     let state = match alarm.state.as_str() {
         "normal" => {
             let side = if alarm.side == "below" { "<" } else { ">" };
-            format!(
-                "{side} {} {}",
-                style::number(alarm.limit, style::decimals(alarm.limit, f64::NAN).min(3)),
-                alarm.unit
-            )
+            format!("{side} {} {}", limit(alarm.limit), alarm.unit)
         }
         _ => state(alarm, now_ns),
     };
@@ -138,6 +134,12 @@ fn draw_alarm(buf: &mut Buffer, area: Rect, row: u16, alarm: &Alarm, now_ns: Opt
         _ => look,
     };
     put_right(buf, area, row, Span::styled(state, state_look));
+}
+
+/// As it was configured, unless that is long.
+fn limit(limit: f64) -> String {
+    const LONGEST: usize = 7;
+    Some(limit.to_string()).filter(|text| text.len() <= LONGEST).unwrap_or_else(|| style::number(limit, 3))
 }
 
 fn details(alarm: &Alarm, width: usize) -> Vec<String> {

@@ -30,15 +30,15 @@ pub(super) enum Column {
 /// What is worth its width, most worthy first; a column that is there already becomes wider.
 const WORTH: [(Column, u16); 18] = [
     (Column::Bed, 10),
-    (Column::Alarm, 4),
+    (Column::Alarm, 5),
     (Column::Rate, 4),
     (Column::Arterial, 12),
     (Column::State, 9),
-    (Column::Output, 11),
+    (Column::Output, 12),
     (Column::Pulmonary, 10),
     (Column::Quality, 8),
-    (Column::Svr, 11),
-    (Column::Pvr, 14),
+    (Column::Svr, 13),
+    (Column::Pvr, 13),
     (Column::Alarm, 18),
     (Column::Lag, 7),
     (Column::Arterial, LONG_PRESSURE),
@@ -49,7 +49,7 @@ const WORTH: [(Column, u16); 18] = [
     (Column::State, 24),
 ];
 /// From this width on a pressure has bands.
-const LONG_PRESSURE: u16 = 18;
+const LONG_PRESSURE: u16 = 22;
 /// From this width on an alarm has a name.
 const LONG_ALARM: usize = 12;
 /// From this width on a state is told as in the header.
@@ -87,7 +87,7 @@ pub(super) fn fitting(width: u16) -> Vec<(Column, u16)> {
 }
 
 pub(super) fn heading(columns: &[(Column, u16)]) -> Line<'static> {
-    line_of(columns, |column, width| (column.heading(width).to_owned(), style::QUIET))
+    line_of(columns, |column, _| (column.heading().to_owned(), style::QUIET))
 }
 
 pub(super) fn line(columns: &[(Column, u16)], row: &Row<'_>) -> Line<'static> {
@@ -115,10 +115,9 @@ impl Column {
         matches!(self, Self::Rate | Self::Lag)
     }
 
-    fn heading(self, width: usize) -> &'static str {
+    fn heading(self) -> &'static str {
         match self {
             Self::Bed => "bed",
-            Self::Alarm if width < LONG_ALARM => "alrm",
             Self::Alarm => "alarm",
             Self::State => "state",
             Self::Quality => "quality",
@@ -172,7 +171,10 @@ fn pressure(bed: &Bed, name: &str, width: usize) -> String {
         let Some(reading) = bed.of_beat(&format!("{name}_{part}")) else { return style::NONE.to_owned() };
         let mean = style::number(f64::from(reading.band.mean), 0);
         let half = 0.5 * f64::from(reading.band.high - reading.band.low);
-        if width < usize::from(LONG_PRESSURE) { mean } else { format!("{mean}±{}", style::number(half, 0)) }
+        if width < usize::from(LONG_PRESSURE) {
+            return mean;
+        }
+        format!("{mean}±{}", style::short_number(half, usize::from(half < 0.95)))
     };
     match ["systolic", "diastolic", "mean"].map(part) {
         parts if parts.iter().all(|part| part == style::NONE) => style::NONE.to_owned(),

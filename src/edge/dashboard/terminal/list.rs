@@ -78,7 +78,7 @@ fn details_height(height: u16, needed: u16) -> u16 {
     if height < 2 + LEAST_BEDS + least {
         return 0;
     }
-    height.saturating_sub(needed).max(least.max(height / 4)).min(height - 2 - LEAST_BEDS)
+    height.saturating_sub(needed).max(least.max(height / 4)).min(height - needed.min(2 + LEAST_BEDS))
 }
 
 fn draw_details(buf: &mut Buffer, area: Rect, name: &str, bed: &Bed, now: Duration) {

@@ -9,6 +9,7 @@ use super::super::bed::{Bed, EventLine};
 use super::paper::{panel, put};
 use super::style;
 
+const NOTE: &str = "note";
 /// Events that say that all is well, or well again.
 const GOOD_EVENTS: [&str; 8] = [
     "start",
@@ -27,15 +28,26 @@ pub(super) fn draw(buf: &mut Buffer, area: Rect, bed: &Bed) {
     if bed.events.is_empty() {
         put(buf, inner, 0, Span::styled("none", style::QUIET));
     }
-    let first = bed.events.len().saturating_sub(usize::from(inner.height));
-    for (row, event) in (0..).zip(bed.events.range(first..)) {
+    for (row, event) in (0..).zip(newest(bed, usize::from(inner.height))) {
         put(buf, inner, row, line(event));
     }
 }
 
+/// The newest so many. The newest note stays among them: what people said is worth more than what happened in between.
+fn newest(bed: &Bed, rows: usize) -> Vec<&EventLine> {
+    const LEAST_WITH_OLD_NOTE: usize = 3;
+    let first = bed.events.len().saturating_sub(rows);
+    let mut events: Vec<&EventLine> = bed.events.range(first..).collect();
+    let note = bed.events.iter().rposition(|event| event.kind == NOTE);
+    if let Some(note) = note.filter(|note| *note < first && rows >= LEAST_WITH_OLD_NOTE) {
+        events[0] = &bed.events[note];
+    }
+    events
+}
+
 fn look(kind: &str) -> Style {
     match kind {
-        "note" => style::INFERRED.patch(style::BOLD),
+        NOTE => style::INFERRED.patch(style::BOLD),
         _ if GOOD_EVENTS.contains(&kind) => style::OBSERVED,
         _ => style::WARNING,
     }

@@ -17,6 +17,8 @@ const SOURCES: [(&str, &str, Style); 3] =
 pub(super) const ROWS: u16 = 7;
 /// Rows for all of them.
 pub(super) const ALL_ROWS: u16 = 1 + QUANTITIES as u16;
+/// From this width on the title has room for words.
+const WIDTH_WITH_WORDS: u16 = 66;
 /// Name, standard deviation, three percentages.
 const TEXT_WIDTH: u16 = 5 + 8 + 13;
 
@@ -29,9 +31,11 @@ fn shares(spread: &Spread) -> Option<[f64; 3]> {
 
 /// The quantities of a group, or with room all of them.
 pub(super) fn draw(buf: &mut Buffer, area: Rect, bed: &Bed, drawn: Group) {
-    let mut title = vec![Span::styled("sd", style::STRONG), Span::styled(" by source, %:", style::QUIET)];
+    let is_narrow = area.width < WIDTH_WITH_WORDS;
+    let by = if is_narrow { ", %" } else { " with sensor noise, % by source:" };
+    let mut title = vec![Span::styled("sd", style::STRONG), Span::styled(by, style::QUIET)];
     for (name, symbol, look) in SOURCES {
-        let name = if area.width < 44 { &name[..4] } else { name };
+        let name = if is_narrow { &name[..3] } else { name };
         title.push(Span::styled(format!(" {symbol}{name}"), look));
     }
     let inner = panel(buf, area, title);

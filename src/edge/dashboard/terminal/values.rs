@@ -32,8 +32,9 @@ pub(super) fn draw_beat(buf: &mut Buffer, area: Rect, bed: &Bed) {
         let (mean, half) = beat_reading(reading);
         let mut spans = vec![
             Span::styled(format!("{label:<4}"), style::INFERRED),
-            Span::styled(format!("{mean:>6}"), style::STRONG),
-            Span::styled(format!(" {half:<6}"), style::QUIET),
+            Span::styled(format!("{mean:>5}"), style::STRONG),
+            // A place is saved where columns would touch.
+            Span::styled(format!(" {:<6}", if width < 18 { half.replace("±0.", "±.") } else { half }), style::QUIET),
         ];
         if width >= WIDTH_WITH_UNITS {
             spans.push(Span::styled(format!(" {}", reading.unit), style::QUIET));
@@ -46,8 +47,19 @@ pub(super) fn draw_beat(buf: &mut Buffer, area: Rect, bed: &Bed) {
 /// Mean, and half the width of the band.
 pub(super) fn beat_reading(reading: &BeatReading) -> (String, String) {
     let (mean, half) = (f64::from(reading.band.mean), 0.5 * f64::from(reading.band.high - reading.band.low));
-    let digits = style::decimals(mean, half);
+    let digits = digits(&reading.name, mean, half);
     (style::number(mean, digits), format!("±{}", style::number(half, digits)))
+}
+
+/// Digits after the point as bedsides write them, and one more where the band would not be seen as one.
+fn digits(name: &str, mean: f64, half: f64) -> usize {
+    let usual: u8 = match name {
+        "heart_rate" | "stroke_volume" => 0,
+        "cardiac_output" | "ejection_fraction" | "svr" => 2,
+        "pvr" => 3,
+        _ => return style::decimals(mean, half),
+    };
+    usize::from(usual) + usize::from(2.0 * half < 0.1_f64.powi(usual.into()))
 }
 
 /// Rows of [`draw`].
