@@ -12,7 +12,7 @@ use super::replay::client_settings;
 use super::serve::{asked_to_stop, tokio_runtime};
 use super::{ConfigArgs, Failure, failed};
 
-/// Watch beds in the terminal: waveforms, parameters, bands, health
+/// Watch beds in the terminal: waveforms, bands, parameters, alarms, health; acknowledge alarms, write notes
 #[derive(Args)]
 #[command(after_help = "Example:  hemostream watch --bed bed1 --connect tcp/127.0.0.1:7447")]
 pub(crate) struct Watch {
@@ -21,6 +21,9 @@ pub(crate) struct Watch {
     /// Bed to show first
     #[arg(long)]
     bed: Option<String>,
+    /// Who signs notes and acknowledgements
+    #[arg(long, value_name = "NAME", default_value = "")]
+    author: String,
     /// Where the daemon listens; over `zenoh.connect` of the configuration
     #[arg(long, value_name = "ENDPOINT")]
     connect: Vec<String>,
@@ -41,8 +44,8 @@ impl Watch {
         });
         let settings = client_settings(&config, &self.connect);
         let bus = runtime.block_on(async { ZenohBus::open(&settings) })?;
-        let watched = terminal::run(&bus, &config.publish.prefix, self.bed.as_deref(), &stop).map_err(failed);
+        let watched = terminal::run(&bus, &config.publish.prefix, self.bed.as_deref(), &self.author, &stop);
         bus.close();
-        watched
+        watched.map_err(failed)
     }
 }

@@ -145,7 +145,7 @@ impl Demo {
             scope.spawn(move || score(&messages, scored, scoring_ended));
             let shown = if self.terminal {
                 let prefix = &config.publish.prefix;
-                terminal::run(bus, prefix, Some(patients::CRISIS_BED), &ended).map_err(failed)
+                terminal::run(bus, prefix, Some(patients::CRISIS_BED), "", &ended).map_err(failed)
             } else {
                 lines(&boards, &ended);
                 Ok(())

@@ -168,7 +168,7 @@ pub(super) struct Bed {
     pub(super) true_parameters: BTreeMap<&'static str, f64>,
     pub(super) parameters: Vec<Parameter>,
     /// Of the last beat that was over, and when it was \[ns\].
-    beat: (i64, Vec<BeatReading>),
+    pub(super) beat: (i64, Vec<BeatReading>),
     /// The same over the last minutes, by name.
     pub(super) beat_trends: BTreeMap<String, History<Band>>,
     pub(super) alarms: Vec<Alarm>,
@@ -522,6 +522,11 @@ impl Parameter {
         let unit = PARAMETERS.iter().find(|p| p.name == name).map_or("", |p| p.unit);
         let [mean, low, high, since_informed_s] = [f64::NAN; 4];
         Self { name, unit, mean, low, high, since_informed_s, is_identifiable: true, trend: History::default() }
+    }
+
+    /// Whether data rather than settings say what it is, and did so lately.
+    pub(super) fn is_informed(&self) -> bool {
+        self.is_identifiable && self.since_informed_s <= UNINFORMED_AFTER_S
     }
 
     fn update(&mut self, time_ns: i64, row: &[f64]) {

@@ -66,6 +66,26 @@ impl<T> History<T> {
         self.rows.back().map(|(t, _)| *t)
     }
 
+    /// Event time of the oldest row.
+    pub(super) fn oldest_ns(&self) -> Option<i64> {
+        self.rows.front().map(|(t, _)| *t)
+    }
+
+    /// The newest row that is not after `time_ns`.
+    pub(super) fn at(&self, time_ns: i64) -> Option<(i64, &T)> {
+        let after = self.rows.partition_point(|(t, _)| *t <= time_ns);
+        after.checked_sub(1).and_then(|last| self.rows.get(last)).map(|(t, row)| (*t, row))
+    }
+
+    /// The rows that are not after `time_ns`.
+    pub(super) fn until(&self, time_ns: i64) -> Self
+    where
+        T: Clone,
+    {
+        let after = self.rows.partition_point(|(t, _)| *t <= time_ns);
+        Self { rows: self.rows.range(..after).cloned().collect(), restarts: self.restarts }
+    }
+
     /// How often the source began anew.
     pub(super) fn restarts(&self) -> u64 {
         self.restarts
@@ -117,6 +137,20 @@ mod tests {
             history.push(ms * MS, 0, LIMITS);
         }
         assert_eq!(times_ms(&history), [100]);
+    }
+
+    #[test]
+    fn the_past_ends_where_it_is_asked_to() {
+        let mut history = History::default();
+        for (ms, row) in [(0, 1), (100, 2), (200, 3)] {
+            history.push(ms * MS, row, LIMITS);
+        }
+        assert_eq!(times_ms(&history.until(199 * MS)), [0, 100]);
+        assert_eq!(
+            [-1, 100, 199, 900].map(|ms| history.at(ms * MS).map(|(_, row)| *row)),
+            [None, Some(2), Some(2), Some(3)]
+        );
+        assert_eq!((history.oldest_ns(), history.until(-1).oldest_ns()), (Some(0), None));
     }
 
     #[test]

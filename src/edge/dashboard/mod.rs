@@ -6,6 +6,7 @@
 mod bed;
 mod feed;
 mod history;
+mod past;
 pub mod terminal;
 mod ward;
 pub mod web;

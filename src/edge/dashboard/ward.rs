@@ -143,11 +143,6 @@ impl Ward {
         self.beds.entry(name).or_default().take(content, arrival, self.memory.shared_by(beds));
     }
 
-    /// Where `bed` stands among the beds in order of name, counted from 0.
-    pub(super) fn position(&self, bed: &str) -> Option<usize> {
-        self.beds.keys().position(|name| name == bed)
-    }
-
     /// The common start of the keys.
     pub(super) fn prefix(&self) -> &str {
         &self.prefix

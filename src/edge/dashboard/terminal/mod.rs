@@ -1,28 +1,45 @@
 //! The terminal dashboard: a bedside monitor for every bed on the bus.
 //!
 //! [`run`] owns the terminal and asks the clock; `ward` is what is known, `ui` what is chosen, `view` a pure function
-//! of both. Deliberately absent: anything that is published.
+//! of both and of the time. What is published is what the person at the keyboard says: notes and acknowledgements, by
+//! `errand` on a thread beside the screen.
 
-mod beds;
-mod panels;
+mod alarms;
+mod bedside;
+mod columns;
+mod errand;
+mod group;
+mod header;
+mod health;
+mod keys;
+mod list;
+mod log;
+mod order;
 mod paper;
+mod parameters;
+mod pause;
+mod prompt;
+mod sources;
 mod style;
 #[cfg(test)]
 mod tests;
 mod traces;
 mod ui;
+mod urgency;
+mod values;
 mod view;
 
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
 use std::thread;
 use std::time::Duration;
 
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event};
 
+use self::errand::{Errand, Outcome};
 use self::ui::{Next, Ui};
 use super::feed::{self, QUEUE, Topics};
 use super::ward::{Memory, Ward};
@@ -38,26 +55,31 @@ const FRAME: Duration = Duration::from_millis(55);
 /// Longest work on messages between two pictures, so that keys are obeyed under any load.
 const SHARE: Duration = Duration::from_millis(30);
 
-/// Shows the beds under `prefix`, `bed` first, until a key or `stop` ends it.
+/// Shows the beds under `prefix`, `bed` first, until a key or `stop` ends it; `author` signs notes and acknowledgements.
 ///
 /// # Errors
 /// When the bus refuses the subscription or the terminal does not work.
-pub fn run(bus: &dyn Bus, prefix: &str, bed: Option<&str>, stop: &AtomicBool) -> io::Result<()> {
+pub fn run(bus: &dyn Bus, prefix: &str, bed: Option<&str>, author: &str, stop: &AtomicBool) -> io::Result<()> {
     let dropped = Arc::new(AtomicU64::new(0));
     let (sender, receiver) = sync_channel(QUEUE);
     let _subscriptions = feed::subscribe(bus, prefix, Topics::All, &sender, &dropped).map_err(io::Error::other)?;
     let (last_sender, last_values) = sync_channel(1);
+    let (errands, errands_to_run) = sync_channel(errand::QUEUE);
+    let (outcome_sender, outcomes) = sync_channel(errand::QUEUE);
     thread::scope(|scope| {
         // Beside the screen, which does not wait for an answer that may never come.
         scope.spawn(move || {
             let _ = last_sender.send(feed::last_values(bus, prefix));
         });
+        scope.spawn(move || {
+            errand::serve(bus, prefix.trim_end_matches('/'), author, &errands_to_run, &outcome_sender);
+        });
         let feed = Feed { receiver, last_values: Some(last_values), dropped };
         // Restores the terminal whichever way this ends.
         let _restore = Restore;
         let mut terminal = ratatui::try_init()?;
-        Screen { ward: Ward::new(prefix, MEMORY), ui: Ui::new(bed), feed, clock: Clock::start() }
-            .run(&mut terminal, stop)
+        let (ward, ui) = (Ward::new(prefix, MEMORY), Ui::new(bed));
+        Screen { ward, ui, feed, errands, outcomes, clock: Clock::start() }.run(&mut terminal, stop)
     })
 }
 
@@ -81,6 +103,8 @@ struct Screen {
     ward: Ward,
     ui: Ui,
     feed: Feed,
+    errands: SyncSender<Errand>,
+    outcomes: Receiver<Outcome>,
     clock: Clock,
 }
 
@@ -95,6 +119,9 @@ impl Screen {
             let frame_start = self.now();
             self.take_messages(frame_start);
             let now = self.now();
+            while let Ok(outcome) = self.outcomes.try_recv() {
+                self.ui.say(outcome, now);
+            }
             terminal.draw(|frame| view::draw(frame, &self.ward, &self.ui, now))?;
             if self.obey_keys(frame_start)? == Next::Quit {
                 break;
@@ -127,6 +154,13 @@ impl Screen {
         }
     }
 
+    fn tell(&mut self, errand: Errand, now: Duration) {
+        if self.errands.try_send(errand).is_err() {
+            let text = format!("not sent: {} messages wait for the daemon already", errand::QUEUE);
+            self.ui.say(Outcome { text, is_failure: true }, now);
+        }
+    }
+
     /// Obeys keys until the next picture is due.
     fn obey_keys(&mut self, frame_start: Duration) -> io::Result<Next> {
         loop {
@@ -136,8 +170,10 @@ impl Screen {
             }
             if let Event::Key(key) = event::read()? {
                 let now = self.now();
-                if self.ui.press(key, &self.ward, now) == Next::Quit {
-                    return Ok(Next::Quit);
+                match self.ui.press(key, &self.ward, now) {
+                    Next::Continue => {}
+                    Next::Quit => return Ok(Next::Quit),
+                    Next::Tell(errand) => self.tell(errand, now),
                 }
             } else {
                 return Ok(Next::Continue);

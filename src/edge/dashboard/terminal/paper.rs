@@ -40,6 +40,21 @@ pub(super) fn panel(buf: &mut Buffer, area: Rect, title: Vec<Span<'static>>) -> 
     Rect { y: area.y + 1, height: area.height - 1, ..area }
 }
 
+/// Words in lines of at most `width` characters; a longer word is a line of its own.
+pub(super) fn wrap(text: &str, width: usize) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split_whitespace() {
+        match lines.last_mut() {
+            Some(line) if line.chars().count() + 1 + word.chars().count() <= width => {
+                line.push(' ');
+                line.push_str(word);
+            }
+            _ => lines.push(word.to_owned()),
+        }
+    }
+    lines
+}
+
 /// What a dot stands for; in a cell that holds several, the last of these gives the colour.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Ink {
@@ -121,6 +136,13 @@ mod tests {
         }
         raster.paint(&mut buf, area, |_| style::PLAIN);
         assert_eq!((buf[(0, 0)].symbol(), buf[(1, 0)].symbol()), ("⠁", "⢀"));
+    }
+
+    #[test]
+    fn words_are_kept_whole() {
+        assert_eq!(wrap("low output, 4.1 L/min", 11), ["low output,", "4.1 L/min"]);
+        assert_eq!(wrap("  unbelievable  ", 4), ["unbelievable"]);
+        assert!(wrap("", 4).is_empty());
     }
 
     #[test]

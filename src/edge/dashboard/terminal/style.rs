@@ -13,6 +13,7 @@ const SKY_BLUE: Color = Color::Indexed(81);
 const BLUISH_GREEN: Color = Color::Indexed(43);
 const ORANGE: Color = Color::Indexed(214);
 const YELLOW: Color = Color::Indexed(227);
+const VERMILLION: Color = Color::Indexed(202);
 
 pub(super) const SCREEN: Style = Style::new().fg(WHITE).bg(BACKGROUND);
 pub(super) const BOLD: Style = Style::new().add_modifier(Modifier::BOLD);
@@ -30,6 +31,20 @@ pub(super) const TRUTH: Style = Style::new().fg(ORANGE).add_modifier(Modifier::B
 pub(super) const WARNING: Style = Style::new().fg(YELLOW).add_modifier(Modifier::BOLD);
 pub(super) const ALARM: Style = Style::new().fg(BACKGROUND).bg(YELLOW).add_modifier(Modifier::BOLD);
 pub(super) const GOOD: Style = Style::new().fg(BACKGROUND).bg(BLUISH_GREEN).add_modifier(Modifier::BOLD);
+/// Alarms that nobody has seen, by priority.
+pub(super) const HIGH: Style = Style::new().fg(BACKGROUND).bg(VERMILLION).add_modifier(Modifier::BOLD);
+pub(super) const MEDIUM: Style = ALARM;
+pub(super) const LOW: Style = Style::new().fg(BACKGROUND).bg(SKY_BLUE).add_modifier(Modifier::BOLD);
+/// The same, once they have been seen.
+pub(super) const HIGH_SEEN: Style = Style::new().fg(VERMILLION).add_modifier(Modifier::BOLD);
+pub(super) const MEDIUM_SEEN: Style = WARNING;
+pub(super) const LOW_SEEN: Style = Style::new().fg(SKY_BLUE).add_modifier(Modifier::BOLD);
+/// Sources of uncertainty.
+pub(super) const EPISTEMIC: Style = INFERRED;
+pub(super) const ALEATORIC: Style = OBSERVED;
+pub(super) const MODEL: Style = Style::new().fg(ORANGE);
+/// Over what else is on the screen.
+pub(super) const HELP: Style = Style::new().fg(WHITE).bg(Color::Indexed(236));
 pub(super) const KEY: Style = Style::new().fg(BACKGROUND).bg(GREY);
 
 /// What stands in place of a number that is not there.
@@ -90,6 +105,14 @@ pub(super) fn duration(seconds: f64) -> String {
     }
 }
 
+/// `text` in at most so many characters; where it is cut, it shows.
+pub(super) fn fit(text: &str, longest: usize) -> String {
+    if text.chars().count() <= longest {
+        return text.to_owned();
+    }
+    text.chars().take(longest.saturating_sub(1)).chain((longest > 0).then_some('…')).collect()
+}
+
 /// Event time: of day if it counts from 1970, else seconds since whatever it counts from.
 pub(super) fn event_time(time_ns: i64) -> String {
     const YEAR_2001_NS: i64 = 1_000_000_000_000_000_000;
@@ -116,6 +139,12 @@ mod tests {
         assert_eq!(shown(1e300, 1.0), "1.0e300");
         assert_eq!([number(-0.04, 1), number(-0.06, 1)], ["0.0", "-0.1"]);
         assert_eq!([short_number(0.25, 2), short_number(-0.25, 2), short_number(10.25, 2)], [".25", "-.25", "10.25"]);
+    }
+
+    #[test]
+    fn what_is_cut_shows_it() {
+        assert_eq!(["abc", "abcd", "äöüß"].map(|text| fit(text, 3)), ["abc", "ab…", "äö…"]);
+        assert_eq!([0, 1].map(|longest| fit("ab", longest)), ["", "…"]);
     }
 
     #[test]

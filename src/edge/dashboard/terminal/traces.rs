@@ -8,9 +8,9 @@ use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 
 use super::super::bed::{Band, Bed, FORECAST_AFTER_S, Liveness, Origin, quantity_names};
+use super::group::Group;
 use super::paper::{DOTS_X, DOTS_Y, Ink, Raster, panel, put, put_right};
 use super::style;
-use super::ui::Group;
 
 /// Room for the numbers at the ends of the vertical axis.
 const LABEL_WIDTH: u16 = 5;
@@ -107,8 +107,18 @@ impl Pen {
     }
 }
 
+/// What of a bed is drawn.
+#[derive(Clone, Copy)]
+pub(super) struct Picture {
+    pub(super) group: Group,
+    pub(super) span_s: u32,
+    /// Whether the right edge is not the present.
+    pub(super) is_past: bool,
+}
+
 /// Draws the six traces of a group; without room for a time axis where `height` is scarce.
-pub(super) fn draw(buf: &mut Buffer, area: Rect, bed: &Bed, group: Group, span_s: u32, now: Duration) {
+pub(super) fn draw(buf: &mut Buffer, area: Rect, bed: &Bed, picture: Picture, now: Duration) {
+    let Picture { group, span_s, is_past } = picture;
     let quantities = group.quantities();
     let mut inner = panel(buf, area, title(bed, group, area.width));
     let traces = quantities.len() as u16;
@@ -120,7 +130,7 @@ pub(super) fn draw(buf: &mut Buffer, area: Rect, bed: &Bed, group: Group, span_s
     if has_axis {
         inner.height -= 1;
         let axis = Rect { x: inner.x + LABEL_WIDTH, y: inner.bottom(), width: plot_width, height: 1 };
-        draw_time_axis(buf, axis, span_s);
+        draw_time_axis(buf, axis, span_s, is_past.then_some(end_ns));
     }
     let height = (inner.height / traces).max(1);
     let liveness = bed.liveness(now);
@@ -166,7 +176,8 @@ fn title(bed: &Bed, group: Group, width: u16) -> Vec<Span<'static>> {
     title
 }
 
-fn draw_time_axis(buf: &mut Buffer, area: Rect, span_s: u32) {
+/// Seconds before the right edge, which is the present unless its time is given.
+fn draw_time_axis(buf: &mut Buffer, area: Rect, span_s: u32, end_ns: Option<i64>) {
     const LEAST_CELLS_PER_MARK: u32 = 10;
     let marks = [1, 2, 5, 10, 20, 30];
     let fits = |step: &u32| span_s / step * LEAST_CELLS_PER_MARK <= u32::from(area.width);
@@ -176,7 +187,8 @@ fn draw_time_axis(buf: &mut Buffer, area: Rect, span_s: u32) {
         let mark = Rect { x: area.x + cells as u16, ..area }.intersection(area);
         put(buf, mark, 0, Span::styled(format!("╵-{back} s"), style::QUIET));
     }
-    put_right(buf, area, 0, Span::styled("now╵", style::QUIET));
+    let (end, look) = end_ns.map_or(("now".to_owned(), style::QUIET), |t| (style::event_time(t), style::WARNING));
+    put_right(buf, area, 0, Span::styled(format!("{end}╵"), look));
 }
 
 /// Smallest and largest value that must be seen.

@@ -1,5 +1,10 @@
 //! The screen as its user sees it, fed with made-up messages.
 
+mod alarms;
+mod keyboard;
+mod list;
+mod past;
+
 use std::time::Duration;
 
 use ratatui::Terminal;
@@ -13,8 +18,8 @@ use super::ui::{Next, Ui};
 use super::view;
 use crate::edge::bus::{Encoding, Message};
 use crate::edge::wire::{
-    self, BeatEstimate, ChannelStatus, Event, Header, PARAMETER_STATISTICS, ParameterEstimate, PressureBlock, SCHEMA,
-    STATE_STATISTICS, StateEstimate, Status, Truth,
+    self, Alarm, Alarms, BeatEstimate, ChannelStatus, Event, Header, Note, PARAMETER_STATISTICS, ParameterEstimate,
+    PressureBlock, SCHEMA, STATE_STATISTICS, StateEstimate, Status, Truth,
 };
 use crate::model::cvsim6::{FlowsAndVolumes, Pressures};
 
@@ -62,14 +67,28 @@ fn parameters(bed: &str, time_ns: i64) -> Message {
     message(&format!("ward/{bed}/estimate/parameters"), &estimate)
 }
 
+/// Name, unit, mean and half the band of what a beat is told by.
+const BEAT: [(&str, &str, f64, f64); 10] = [
+    ("cardiac_output", "L/min", 5.12, 0.12),
+    ("svr", "mmHg s/mL", 0.93, 0.04),
+    ("pvr", "mmHg s/mL", 0.081, 0.004),
+    ("p_a_systolic", "mmHg", 120.0, 2.0),
+    ("p_a_diastolic", "mmHg", 70.0, 0.4),
+    ("p_a_mean", "mmHg", 88.0, 1.0),
+    ("p_pa_systolic", "mmHg", 25.0, 1.0),
+    ("p_pa_diastolic", "mmHg", 10.0, 1.0),
+    ("p_pa_mean", "mmHg", 15.0, 1.0),
+    ("unheard_of", "", 1.0, 0.0),
+];
+
 fn beat(bed: &str, time_ns: i64) -> Message {
     let estimate = BeatEstimate {
         header: header(time_ns),
         members: 100,
         end_ns: time_ns + 800 * MS,
-        names: vec!["cardiac_output".to_owned(), "pvr".to_owned(), "unheard_of".to_owned()],
-        units: vec!["L/min".to_owned(), "mmHg s/mL".to_owned(), String::new()],
-        values: vec![5.12, 0.06, 5.0, 5.24, 0.081, 0.002, 0.077, 0.085, 1.0, 0.0, 1.0, 1.0],
+        names: BEAT.map(|(name, ..)| name.to_owned()).to_vec(),
+        units: BEAT.map(|(_, unit, ..)| unit.to_owned()).to_vec(),
+        values: BEAT.iter().flat_map(|(.., mean, half)| [*mean, *half, mean - half, mean + half]).collect(),
     };
     message(&format!("ward/{bed}/estimate/beat"), &estimate)
 }
@@ -125,6 +144,32 @@ fn status(bed: &str, time_ns: i64) -> Message {
         disagreement: Vec::new(),
     };
     message(&format!("ward/{bed}/status"), &status)
+}
+
+/// An alarm on something of which a limit of 25 was passed at 7 s.
+fn alarm(name: &str, priority: &str, state: &str, acknowledged: bool) -> Alarm {
+    Alarm {
+        name: name.to_owned(),
+        quantity: "p_pa_mean".to_owned(),
+        unit: "mmHg".to_owned(),
+        priority: priority.to_owned(),
+        state: state.to_owned(),
+        acknowledged,
+        side: "above".to_owned(),
+        limit: 25.0,
+        since_ns: 7000 * MS,
+        band: [29.0, 28.0, 30.0],
+        text: format!("what is the matter with {name}"),
+    }
+}
+
+fn alarms(bed: &str, alarms: Vec<Alarm>) -> Message {
+    message(&format!("ward/{bed}/alarm"), &Alarms { header: header(0), alarms })
+}
+
+fn note(bed: &str, time_ns: i64, text: &str) -> Message {
+    let note = Note { schema: SCHEMA, time_ns, author: "Dr. Weber".to_owned(), text: text.to_owned() };
+    message(&format!("ward/{bed}/note"), &note)
 }
 
 fn event(bed: &str, time_ns: i64, text: &str) -> Message {
@@ -190,7 +235,12 @@ fn names_numbers_truth_health_events_and_keys_are_on_the_screen() {
         );
         assert_shows(&screen, &["not converged 3!", "rms 1.04", "rms 2.50!", "silent"]);
         assert_shows(&screen, &["gap", "nothing heard for 3 s"]);
-        assert_shows(&screen, &[" q  quit", "Tab", "beds", "pause", "+/-", "pressures/flows/volumes"]);
+        for keys in ["? help", "q quit", "Tab", "b beds", "p ", "←→ ", "+- ", "f ", "u ", "a ack", "n note"] {
+            let (key, meaning) = keys.split_once(' ').unwrap();
+            let last = screen.lines().last().unwrap();
+            let (short, long) = (format!("{key} {meaning}"), format!("{key}  {meaning}"));
+            assert!(last.contains(&short) || last.contains(&long), "`{keys}` is missing from\n{last}");
+        }
         assert!(screen.contains(|c| ('\u{2801}'..='\u{28ff}').contains(&c)), "no waveform in\n{screen}");
         assert!(!screen.contains("STALE"), "{screen}");
     }
@@ -203,7 +253,7 @@ fn the_last_beat_is_on_the_screen_and_cardiac_output_in_the_header_and_the_list(
     for size in SIZES {
         assert_shows(screen(&ward, &ui, 10 * SECOND, size).lines().next().unwrap(), &["CO 5.12±0.12"]);
     }
-    assert_shows(&screen(&ward, &ui, 10 * SECOND, (200, 60)), &["last beat", "CO    5.12 ±0.12", "PVR 0.0810 ±0.0040"]);
+    assert_shows(&screen(&ward, &ui, 10 * SECOND, (200, 60)), &["last beat", "CO   5.12 ±0.12", "PVR 0.081 ±0.004"]);
     press(&mut ui, &ward, KeyCode::Char('b'));
     assert_shows(&screen(&ward, &ui, 10 * SECOND, (120, 40)), &["CO L/min", "5.12 ±0.12"]);
 }
@@ -362,9 +412,12 @@ fn numbers_that_are_none_are_drawn_as_none() {
 #[test]
 fn any_size_is_drawn_without_fault() {
     let mut ui = Ui::new(None);
-    let ward = filled();
-    for list in [false, true] {
-        ui.is_list = list;
+    let mut ward = filled();
+    let states = ["active", "latched", "pending", "normal"];
+    let all = states.into_iter().flat_map(|state| ["high", "medium", "low"].map(|p| alarm(state, p, state, false)));
+    ward.apply(&alarms("bed1", all.collect()), 10 * SECOND);
+    for (list, sources, help) in [(false, false, false), (true, false, false), (false, true, true)] {
+        (ui.is_list, ui.shows_sources, ui.shows_help) = (list, sources, help);
         for width in (1..210).step_by(3) {
             for height in (1..70).step_by(2) {
                 screen(&ward, &ui, 10 * SECOND, (width, height));
@@ -445,7 +498,7 @@ fn keys_choose_the_bed_the_span_and_the_quantities() {
     ward.apply(&state("bed3", 0, 0.0), 10 * SECOND);
     let mut ui = Ui::new(Some("bed2"));
     let mut walk = Vec::new();
-    for code in [KeyCode::Tab, KeyCode::Right, KeyCode::Down, KeyCode::BackTab, KeyCode::Left] {
+    for code in [KeyCode::Tab, KeyCode::Tab, KeyCode::Down, KeyCode::BackTab, KeyCode::Up] {
         press(&mut ui, &ward, code);
         walk.push(ui.bed_name(&ward).unwrap().to_owned());
     }
@@ -458,42 +511,8 @@ fn keys_choose_the_bed_the_span_and_the_quantities() {
     assert_eq!(ui.span_s(), 2);
     for expected in ["flows mL/s", "volumes mL", "pressures mmHg"] {
         press(&mut ui, &ward, KeyCode::Char('f'));
-        assert_shows(screen(&ward, &ui, 10 * SECOND, (80, 24)).lines().nth(1).unwrap(), &[expected]);
+        assert_shows(screen(&ward, &ui, 10 * SECOND, (80, 24)).lines().nth(2).unwrap(), &[expected]);
     }
-}
-
-#[test]
-fn the_list_shows_every_bed_and_escape_leaves_the_list_first() {
-    let mut ward = filled();
-    ward.apply(&state("bed2", 0, 0.0), 7 * SECOND);
-    let mut ui = Ui::new(None);
-    press(&mut ui, &ward, KeyCode::Char('b'));
-    for size in SIZES {
-        let list = screen(&ward, &ui, 10 * SECOND, size);
-        assert_shows(&list, &["2 beds under ward", "▶ bed1", "bed2", "LIVE", "STALE for 3.0 s", "70.0 ±4.0"]);
-    }
-    assert_eq!(press(&mut ui, &ward, KeyCode::Esc), Next::Continue);
-    assert!(!ui.is_list);
-    assert_eq!(press(&mut ui, &ward, KeyCode::Esc), Next::Quit);
-    assert_eq!(press(&mut ui, &ward, KeyCode::Char('q')), Next::Quit);
-    let control_c = KeyEvent::new(KeyCode::Char('c'), KeyModifiers::CONTROL);
-    assert_eq!(ui.press(control_c, &ward, SECOND), Next::Quit);
-}
-
-#[test]
-fn pause_keeps_the_picture_while_the_ward_goes_on() {
-    let mut ward = filled();
-    let mut ui = Ui::new(None);
-    press(&mut ui, &ward, KeyCode::Char('p'));
-    let before = screen(&ward, &ui, 10 * SECOND, (120, 40));
-    for i in 0..100 {
-        ward.apply(&state("bed1", (10_000 + 20 * i) * MS, 0.0), 12 * SECOND);
-    }
-    let after = screen(&ward, &ui, 10 * SECOND, (120, 40));
-    assert_eq!(before, after);
-    assert_shows(&after, &["PAUSED", "resume"]);
-    press(&mut ui, &ward, KeyCode::Char('p'));
-    assert_shows(&screen(&ward, &ui, 12 * SECOND, (120, 40)), &["LIVE", "12.0 s"]);
 }
 
 #[test]

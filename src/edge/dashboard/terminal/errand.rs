@@ -1,0 +1,75 @@
+//! What the daemon is told from the keyboard, on a thread beside the screen: the daemon may take seconds to answer.
+
+use std::sync::mpsc::{Receiver, SyncSender};
+
+use crate::edge::bus::Bus;
+use crate::edge::operator::{Operator, OperatorError};
+use crate::estimate::time::EventTime;
+
+/// Errands that may wait for the one under way; a further one is refused.
+pub(super) const QUEUE: usize = 8;
+
+/// Something to tell the daemon.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Errand {
+    /// An alarm was seen, or without a name all of the bed.
+    Acknowledge { bed: String, alarm: Option<String> },
+    /// Something about a bed.
+    Note { bed: String, time: EventTime, text: String },
+}
+
+/// What has become of an errand, for people.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Outcome {
+    pub(super) text: String,
+    pub(super) is_failure: bool,
+}
+
+impl Errand {
+    /// What is under way.
+    pub(super) fn announcement(&self) -> String {
+        match self {
+            Self::Acknowledge { bed, alarm: Some(alarm) } => format!("acknowledging in {bed}: {alarm} ..."),
+            Self::Acknowledge { bed, alarm: None } => format!("acknowledging all alarms of {bed} ..."),
+            Self::Note { bed, .. } => format!("sending a note about {bed} ..."),
+        }
+    }
+
+    fn run(&self, bus: &dyn Bus, prefix: &str, author: &str) -> Result<String, OperatorError> {
+        match self {
+            Self::Acknowledge { bed, alarm } => {
+                let seen = Operator { bus, prefix, bed }.acknowledge(alarm.as_deref(), author)?;
+                let names: Vec<&str> = seen.iter().map(|alarm| alarm.name.as_str()).collect();
+                Ok(match names.join(", ") {
+                    names if names.is_empty() => format!("nothing sent: no alarm of {bed} waits any more"),
+                    names => format!("sent and confirmed by the daemon: {names} of {bed} acknowledged"),
+                })
+            }
+            Self::Note { bed, time, text } => {
+                let (time, heard) = Operator { bus, prefix, bed }.note(text, author, Some(*time))?;
+                let unheard = if heard { "" } else { "; nobody listens" };
+                Ok(format!("sent: note about {bed} at {}{unheard}", super::style::event_time(time.0)))
+            }
+        }
+    }
+}
+
+/// Runs errands until there will be no more, and says what has become of each.
+pub(super) fn serve(
+    bus: &dyn Bus,
+    prefix: &str,
+    author: &str,
+    errands: &Receiver<Errand>,
+    outcomes: &SyncSender<Outcome>,
+) {
+    for errand in errands {
+        let outcome = match errand.run(bus, prefix, author) {
+            Ok(text) => Outcome { text, is_failure: false },
+            Err(error) => Outcome { text: format!("failed: {error}"), is_failure: true },
+        };
+        // A screen that takes none is gone.
+        if outcomes.send(outcome).is_err() {
+            return;
+        }
+    }
+}
