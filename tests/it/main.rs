@@ -24,5 +24,6 @@ mod surprise;
 mod tidy;
 mod twin;
 mod validate;
+mod web;
 mod window;
 mod xtfc;

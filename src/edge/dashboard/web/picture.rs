@@ -199,3 +199,114 @@ fn estimate_numbers(rows: &[(i64, &StateRow)], quantities: &[usize]) -> Vec<f32>
     }
     numbers
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::ward::Memory;
+    use super::*;
+    use crate::edge::bus::{Encoding, Message};
+    use crate::edge::wire::{self, Event, Header, SCHEMA, STATE_STATISTICS, StateEstimate};
+
+    const REACH: Reach = Reach { connected: true, dropped: 0 };
+    const MS: i64 = 1_000_000;
+
+    fn header(time_ns: i64) -> Header {
+        Header { schema: SCHEMA, seed: 1, config_hash: 2, sequence: 0, time_ns }
+    }
+
+    fn ward() -> Ward {
+        Ward::new("ward", Memory { history_s: 60, rows: 10_000 })
+    }
+
+    fn say<T: serde::Serialize>(ward: &mut Ward, topic: &str, message: &T) {
+        let payload = wire::encode(message).unwrap();
+        let message = Message { key: format!("ward/bed1/{topic}"), encoding: Encoding::Bincode, payload };
+        ward.apply(&message, Duration::from_secs(1));
+    }
+
+    /// An estimate of two pressures; the mean of the first is its time in ms.
+    #[allow(clippy::cast_precision_loss)]
+    fn estimate(ward: &mut Ward, ms: i64) {
+        let row = |mean: f64| [mean, 1.0, 0.5, 0.6, 0.7, mean - 1.0, mean + 2.0];
+        let values: Vec<f64> = [ms as f64, 7.0].into_iter().flat_map(row).collect();
+        assert_eq!(values.len(), 2 * STATE_STATISTICS.len());
+        let names = ["p_a", "p_pv"].map(str::to_owned).to_vec();
+        let (times_ns, since_data_s) = (vec![ms * MS], vec![0.0]);
+        let message = StateEstimate { header: header(ms * MS), members: 9, times_ns, since_data_s, names, values };
+        say(ward, "estimate/state", &message);
+    }
+
+    fn event(ward: &mut Ward, ms: i64, kind: &str) {
+        let (kind, channel, text) = (kind.to_owned(), String::new(), "text".to_owned());
+        say(ward, "event", &Event { header: header(ms * MS), kind, channel, text });
+    }
+
+    fn read(bytes: &[u8]) -> (Value, Vec<f32>) {
+        let length = usize::try_from(u32::from_le_bytes(bytes[..4].try_into().unwrap())).unwrap();
+        let numbers = bytes[(4 + length).next_multiple_of(4)..].chunks_exact(4);
+        let numbers = numbers.map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+        (serde_json::from_slice(&bytes[4..4 + length]).unwrap(), numbers)
+    }
+
+    fn next(picture: &mut BedPicture, ward: &Ward, with_rest: bool) -> Option<(Value, Vec<f32>)> {
+        picture.next(ward, Duration::from_secs(1), with_rest, REACH).map(|bytes| read(&bytes))
+    }
+
+    fn picture(spacing_ms: i64) -> BedPicture {
+        BedPicture::new("bed1".to_owned(), &["p_a".to_owned()], spacing_ms * MS)
+    }
+
+    #[test]
+    fn the_past_comes_first_and_then_only_what_is_new() {
+        let (mut ward, mut picture) = (ward(), picture(8));
+        event(&mut ward, 0, "start");
+        (0..3).for_each(|i| estimate(&mut ward, 20 * i));
+        let (head, numbers) = next(&mut picture, &ward, false).unwrap();
+        assert_eq!((&head["reset"], &head["parts"][0]["n"]), (&json!(true), &json!(3)));
+        assert_eq!(head["parts"][0]["quantities"], json!(["p_a"]));
+        // Times, then time since data, means, 5 % and 95 %.
+        let expected = [0.0, 0.02, 0.04, 0.0, 0.0, 0.0, 0.0, 20.0, 40.0, -1.0, 19.0, 39.0, 2.0, 22.0, 42.0];
+        assert_eq!(numbers, expected);
+        assert_eq!(head["events"][0]["kind"], "start");
+        assert_eq!(head["quantities"][5]["epistemic_sd"], json!(0.5));
+
+        assert!(next(&mut picture, &ward, false).is_none());
+        estimate(&mut ward, 60);
+        event(&mut ward, 60, "gap");
+        let (head, numbers) = next(&mut picture, &ward, false).unwrap();
+        assert_eq!((&head["reset"], &head["parts"][0]["t0_ns"]), (&json!(false), &json!("60000000")));
+        assert_eq!(numbers, [0.0, 0.0, 60.0, 59.0, 62.0]);
+        assert!(head.get("events").is_none());
+        let (head, _) = next(&mut picture, &ward, true).unwrap();
+        assert_eq!(head["events"].as_array().unwrap().len(), 1);
+        assert_eq!(head["events"][0]["kind"], "gap");
+    }
+
+    #[test]
+    fn points_closer_than_asked_for_are_left_out() {
+        let (mut ward, mut picture) = (ward(), picture(100));
+        (0..20).for_each(|i| estimate(&mut ward, 20 * i));
+        let (head, _) = next(&mut picture, &ward, false).unwrap();
+        assert_eq!(head["parts"][0]["n"], 4);
+    }
+
+    #[test]
+    fn event_time_that_begins_anew_begins_the_picture_anew() {
+        let (mut ward, mut picture) = (ward(), picture(8));
+        estimate(&mut ward, 100_000);
+        assert_eq!(next(&mut picture, &ward, false).unwrap().0["reset"], true);
+        estimate(&mut ward, 0);
+        let (head, _) = next(&mut picture, &ward, false).unwrap();
+        assert_eq!((&head["reset"], &head["now_ns"]), (&json!(true), &json!("0")));
+    }
+
+    #[test]
+    fn a_bed_that_nobody_knows_is_said_to_be_unknown_until_it_appears() {
+        let (mut ward, mut picture) = (ward(), picture(8));
+        assert!(next(&mut picture, &ward, false).is_none());
+        assert_eq!(next(&mut picture, &ward, true).unwrap().0["known"], false);
+        estimate(&mut ward, 0);
+        let (head, _) = next(&mut picture, &ward, false).unwrap();
+        assert_eq!((&head["known"], &head["reset"]), (&json!(true), &json!(true)));
+    }
+}
