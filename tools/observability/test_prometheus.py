@@ -163,8 +163,13 @@ class Scraped(unittest.TestCase):
         self.assertEqual(len(mean), len(BEDS))
         for row in zip(low, mean, high, strict=True):
             self.assertTrue(2.0 < row[0] < row[1] < row[2] < 10.0, row)
-        windows = values(self.prometheus.query("rate(hemostream_bed_windows_total[10s])"))
-        self.assertTrue(windows and all(rate > 100.0 for rate in windows), windows)
+
+        def flows() -> bool:
+            windows = values(self.prometheus.query("rate(hemostream_bed_windows_total[10s])"))
+            return len(windows) == len(BEDS) and all(rate > 100.0 for rate in windows)
+
+        # 250 are due; the first scrapes do not fill the ten seconds.
+        until(flows, 20.0, "a hundred windows per second and bed")
         # What was late in starting may have been told; the alert ends with its reason.
         until(lambda: calm() and not self.prometheus.alerts(LAG_ALERT), 20.0, "no alert of lag without lag")
         self.assertEqual(self.prometheus.alerts("HemostreamNotConnected"), [])
@@ -176,10 +181,11 @@ class Scraped(unittest.TestCase):
             for target in panel.get("targets", []):
                 expression = target["expr"].replace("$__rate_interval", "10s").replace("$bed", "|".join(BEDS))
                 with self.subTest(panel=panel["title"], expression=expression):
-                    result = self.prometheus.query(expression)
-                    # Where nothing was ever refused there is no such counter.
-                    if "hemostream_bed_refused_total" not in expression:
-                        self.assertTrue(result, "no data")
+                    # Where nothing was ever refused there is no such counter; a rate needs two scrapes.
+                    if "hemostream_bed_refused_total" in expression:
+                        result = self.prometheus.query(expression)
+                    else:
+                        result = until(lambda e=expression: self.prometheus.query(e), 15.0, "data")
                     # A legend names labels that are there.
                     for label in re.findall(r"{{(\w+)}}", target["legendFormat"]):
                         self.assertTrue(all(label in series["metric"] for series in result), label)
