@@ -127,7 +127,7 @@ async fn metrics_have_what_alerts_need() {
     daemon_says(&bus);
     let text = known(&web, "/metrics").await;
     for line in [
-        "hemostream_bed_window_lag_seconds{bed=\"bed1\",quantile=\"0.99\"} 0.25",
+        "hemostream_bed_window_lag_seconds{bed=\"bed1\",stat=\"p99\"} 0.25",
         "hemostream_bed_members_alive{bed=\"bed1\"} 90.0",
         "hemostream_bed_refused_total{bed=\"bed1\",cause=\"late\"} 7",
         "hemostream_bed_windows_total{bed=\"bed1\"} 12",

@@ -119,9 +119,9 @@ fn of_process(scrape: &mut Scrape<'_>, own: Own) {
 fn of_daemon(scrape: &mut Scrape<'_>, now: Duration) {
     const LAG: &str = "From the closing of a window to its estimate being handed over, in the last minute or so";
     scrape.gauges("bed_window_lag", LAG, Some(Unit::Seconds), |bed| {
-        let quantiles = |s: &Status| [("0.5", s.lag_p50_ms), ("0.99", s.lag_p99_ms), ("1", s.lag_max_ms)];
-        let all = bed.status.iter().flat_map(quantiles);
-        all.map(|(quantile, ms)| (vec![("quantile", quantile.to_owned())], ms * 1e-3)).collect()
+        let statistics = |s: &Status| [("p50", s.lag_p50_ms), ("p99", s.lag_p99_ms), ("max", s.lag_max_ms)];
+        let all = bed.status.iter().flat_map(statistics);
+        all.map(|(stat, ms)| (vec![("stat", stat.to_owned())], ms * 1e-3)).collect()
     });
     let age = "Since the newest estimate arrived";
     scrape.gauges("bed_estimate_age", age, Some(Unit::Seconds), |bed| {
