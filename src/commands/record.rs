@@ -95,6 +95,9 @@ fn summarise(summary: &Summary) {
         summary.bytes as f64 / 1e6,
         summary.dropped
     ));
+    if summary.lost > 0 {
+        say(format!("messages that never came, by their sequence numbers: {}", summary.lost));
+    }
     if !summary.refused.is_empty() {
         let refused = list(summary.refused.iter().map(|(cause, n)| format!("{n} {cause}")).collect());
         say(format!("messages not recorded: {refused}"));

@@ -85,6 +85,9 @@ pub struct Summary {
     pub refused: BTreeMap<&'static str, u64>,
     /// Messages that found the queue full.
     pub dropped: u64,
+    /// Messages that sequence numbers say were sent and never came: samples and estimates are dropped by a network that
+    /// is busy. Those that found the queue full are among them.
+    pub lost: u64,
 }
 
 /// Why a recording ends badly.
@@ -317,7 +320,8 @@ impl Recorder {
         for buffer in self.buffers.values() {
             let _ = self.merger.ask(Job { folder: buffer.folder.clone(), all: false });
         }
-        Ok(Summary { beds: self.beds.len(), ..self.summary })
+        let lost = self.beds.values().fold(0_u64, |sum, bed| sum.saturating_add(bed.lost()));
+        Ok(Summary { beds: self.beds.len(), lost, ..self.summary })
     }
 }
 
