@@ -93,7 +93,9 @@ impl Rows {
             (false, true) => values::ROWS,
             (false, false) => 0,
         };
-        let has_room = rest >= numbers + values::BEAT_ROWS + LEAST_HEALTH;
+        // Channels, the last of health, are worth more than a beat beside other numbers.
+        let health_beside = if numbers > 0 && !shows_sources { health.max(LEAST_HEALTH) } else { LEAST_HEALTH };
+        let has_room = rest >= numbers + values::BEAT_ROWS + health_beside;
         let beat = if has_room && bed.has_beats() { values::BEAT_ROWS } else { 0 };
         let mut spare = rest.saturating_sub(numbers + beat + health);
         let mut take = |wanted: u16| {

@@ -27,7 +27,7 @@ const MOST_EVENTS: u16 = 8;
 pub(super) fn draw(buf: &mut Buffer, area: Rect, ward: &Ward, ui: &Ui, now: Duration) {
     let beds = listed(ward, ui.order, &ui.filter, now);
     let chosen = ui.bed_name(ward).unwrap_or_default();
-    let needed = 2 + u16::try_from(beds.len()).unwrap_or(u16::MAX);
+    let needed = 2 + u16::try_from(beds.len().max(1)).unwrap_or(u16::MAX - 2);
     let details_height = details_height(area.height, needed);
     let list = Rect { height: area.height - details_height, ..area };
     let inner = panel(buf, list, title(ward, ui, beds.len()));

@@ -72,9 +72,10 @@ fn a_note_is_about_what_was_on_the_screen_when_it_was_begun() {
     };
     assert_eq!(press(&mut ui, &ward, KeyCode::Enter), note(9980 * MS, "q bolus"));
     press(&mut ui, &ward, KeyCode::Left);
+    press(&mut ui, &ward, KeyCode::Left);
     press(&mut ui, &ward, KeyCode::Char('n'));
     typed(&mut ui, &ward, "then");
-    assert_eq!(press(&mut ui, &ward, KeyCode::Enter), note(10_500 * MS, "then"));
+    assert_eq!(press(&mut ui, &ward, KeyCode::Enter), note(9000 * MS, "then"));
     press(&mut ui, &ward, KeyCode::Char('n'));
     typed(&mut ui, &ward, "nothing");
     assert_eq!(press(&mut ui, &ward, KeyCode::Esc), Next::Continue);

@@ -13,7 +13,7 @@ fn pause_keeps_the_picture_while_the_ward_goes_on() {
     }
     let after = screen(&ward, &ui, 10 * SECOND, (120, 40));
     assert_eq!(before, after);
-    assert_shows(&after, &["PAUSED", "resume"]);
+    assert_shows(&after, &["PAUSED", "l live"]);
     press(&mut ui, &ward, KeyCode::Char('p'));
     assert_shows(&screen(&ward, &ui, 12 * SECOND, (120, 40)), &["LIVE", "12.0 s"]);
 }
