@@ -204,7 +204,7 @@ fn bad_records_are_refused_with_reasons() {
 fn bad_usage_and_bad_settings_exit_with_2() {
     for (arguments, expected) in [
         (vec!["estimate", "no-such.csv", "--output", "x.csv"], "no-such.csv"),
-        (vec!["estimate", "x.csv", "--output", "x.parquet"], "expected .csv"),
+        (vec!["estimate", "x.csv", "--output", "x.xls"], "expected .csv or .parquet"),
         (vec!["config", "--set", "window.lenght_s=1"], "did you mean `window.length_s`"),
         (vec!["config", "--set", "patient.c_a=-1"], "patient.c_a"),
         (vec!["config", "--set", "estimator.members=0"], "estimator.members"),
