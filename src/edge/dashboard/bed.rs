@@ -306,7 +306,9 @@ impl Bed {
     }
 
     fn is_beating(&self) -> bool {
-        self.history.newest_ns().is_some_and(|now_ns| now_ns.saturating_sub(self.beat.0) <= PRESENT_BEAT_NS)
+        // Who does not listen to estimates has the status to tell the time by.
+        let now_ns = self.history.newest_ns().max(self.status.as_ref().map(|status| status.header.time_ns));
+        now_ns.is_some_and(|now_ns| now_ns.saturating_sub(self.beat.0) <= PRESENT_BEAT_NS)
     }
 
     /// A clinical quantity of the last beat, unless that was long ago: what does not beat has no output.
