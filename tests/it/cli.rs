@@ -205,6 +205,9 @@ fn bad_usage_and_bad_settings_exit_with_2() {
     for (arguments, expected) in [
         (vec!["estimate", "no-such.csv", "--output", "x.csv"], "no-such.csv"),
         (vec!["estimate", "x.csv", "--output", "x.xls"], "expected .csv or .parquet"),
+        (vec!["record", "--output", "x", "--flush-s", "0"], "expected a number above 0"),
+        (vec!["replay", "--recording", "no-such"], "no-such: found no bed, expected a recording"),
+        (vec!["replay", "--bed", "a", "--bed", "b"], "--bed: found several"),
         (vec!["config", "--set", "window.lenght_s=1"], "did you mean `window.length_s`"),
         (vec!["config", "--set", "patient.c_a=-1"], "patient.c_a"),
         (vec!["config", "--set", "estimator.members=0"], "estimator.members"),
@@ -240,6 +243,8 @@ fn every_command_has_help_with_an_example() {
         "replay",
         "watch",
         "dashboard",
+        "record",
+        "convert",
         "note",
         "acknowledge",
         "simulate",

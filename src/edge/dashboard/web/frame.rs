@@ -68,7 +68,7 @@ mod tests {
             assert_eq!(head["parts"][0]["part"], "x".repeat(pad));
             let numbers = &bytes[(4 + head_length).next_multiple_of(4)..];
             assert_eq!(numbers.len(), 8);
-            assert_eq!(f32::from_le_bytes(numbers[..4].try_into().unwrap()), 1.5);
+            assert_eq!(numbers[..4], 1.5_f32.to_le_bytes());
             assert!(f32::from_le_bytes(numbers[4..].try_into().unwrap()).is_nan());
         }
     }

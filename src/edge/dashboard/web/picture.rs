@@ -200,7 +200,9 @@ fn estimate_numbers(rows: &[(i64, &StateRow)], quantities: &[usize]) -> Vec<f32>
     numbers
 }
 
+// What is sent is what was said, to the last bit.
 #[cfg(test)]
+#[allow(clippy::float_cmp)]
 mod tests {
     use super::super::super::ward::Memory;
     use super::*;

@@ -236,7 +236,7 @@ fn names_numbers_truth_health_events_and_keys_are_on_the_screen() {
         assert_shows(&screen, &["not converged 3!", "rms 1.04", "rms 2.50!", "silent"]);
         assert_shows(&screen, &["gap", "nothing heard for 3 s"]);
         for keys in ["? help", "q quit", "Tab", "b beds", "p ", "←→ ", "+- ", "f ", "u ", "a ack", "n note"] {
-            let (key, meaning) = keys.split_once(' ').unwrap();
+            let (key, meaning) = keys.split_once(' ').unwrap_or((keys, ""));
             let last = screen.lines().last().unwrap();
             let (short, long) = (format!("{key} {meaning}"), format!("{key}  {meaning}"));
             assert!(last.contains(&short) || last.contains(&long), "`{keys}` is missing from\n{last}");
