@@ -1,8 +1,6 @@
 //! `hemostream record`: what crosses the bus, into columnar files.
 
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use hemostream::edge::files::units::Units;
@@ -10,7 +8,7 @@ use hemostream::edge::recording::recorder::{RecordError, RecordOptions, Summary,
 use hemostream::edge::zenoh::ZenohBus;
 
 use super::replay::client_settings;
-use super::serve::{asked_to_stop, tokio_runtime};
+use super::serve::{stop_when_asked, tokio_runtime};
 use super::simulate::positive;
 use super::{ConfigArgs, Failure, log_to_stderr, progress_bar, say};
 
@@ -53,13 +51,8 @@ impl Record {
             max_beds: config.service.max_beds,
         };
         let units = Units::of_model(&config.circulation()?);
-        let stop = Arc::new(AtomicBool::new(false));
         let runtime = tokio_runtime()?;
-        let stopping = Arc::clone(&stop);
-        runtime.spawn(async move {
-            asked_to_stop().await;
-            stopping.store(true, Ordering::Relaxed);
-        });
+        let stop = stop_when_asked(&runtime);
         let settings = client_settings(&config, &self.connect);
         let bus = runtime.block_on(async { ZenohBus::open(&settings) })?;
         say(format!("recording {}/* into {}; Ctrl-C stops", options.prefix, self.output.display()));

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use clap::Args;
 use hemostream::edge::config::{Config, ZenohMode, ZenohSettings};
@@ -10,7 +10,7 @@ use hemostream::edge::recording::playback::{Playback, play};
 use hemostream::edge::replay::{Bed, ReplayOptions, Source, run, wait_for_listener, wait_for_listener_at};
 use hemostream::edge::zenoh::ZenohBus;
 
-use super::serve::{asked_to_stop, tokio_runtime};
+use super::serve::{stop_when_asked, tokio_runtime};
 use super::simulate::{not_negative, positive};
 use super::{ConfigArgs, Failure, log_to_stderr, progress_bar, say};
 
@@ -92,13 +92,8 @@ impl Replay {
 
     /// A bus, and what is set when it is time to stop.
     fn connect(&self, config: &Config) -> Result<Connected, Failure> {
-        let stop = Arc::new(AtomicBool::new(false));
         let runtime = tokio_runtime()?;
-        let stopping = Arc::clone(&stop);
-        runtime.spawn(async move {
-            asked_to_stop().await;
-            stopping.store(true, Ordering::Relaxed);
-        });
+        let stop = stop_when_asked(&runtime);
         let settings = client_settings(config, &self.connect);
         let bus = runtime.block_on(async { ZenohBus::open(&settings) })?;
         Ok(Connected { bus, stop, to: settings.connect.join(", "), _runtime: runtime })

@@ -1,6 +1,7 @@
 //! `hemostream serve`: the daemon.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clap::Args;
@@ -114,6 +115,17 @@ pub(crate) async fn asked_to_stop() {
         }
     }
     let _ = tokio::signal::ctrl_c().await;
+}
+
+/// A flag for threads, which cannot wait on a signal: set on Ctrl-C or SIGTERM.
+pub(crate) fn stop_when_asked(runtime: &tokio::runtime::Runtime) -> Arc<AtomicBool> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let stopping = Arc::clone(&stop);
+    runtime.spawn(async move {
+        asked_to_stop().await;
+        stopping.store(true, Ordering::Relaxed);
+    });
+    stop
 }
 
 impl Serve {

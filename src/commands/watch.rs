@@ -1,15 +1,13 @@
 //! `hemostream watch`: the terminal dashboard.
 
 use std::io::IsTerminal;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use hemostream::edge::dashboard::terminal;
 use hemostream::edge::zenoh::ZenohBus;
 
 use super::replay::client_settings;
-use super::serve::{asked_to_stop, tokio_runtime};
+use super::serve::{stop_when_asked, tokio_runtime};
 use super::{ConfigArgs, Failure, failed};
 
 /// Watch beds in the terminal: waveforms, bands, parameters, alarms, health; acknowledge alarms, write notes
@@ -35,13 +33,8 @@ impl Watch {
         if !std::io::stdout().is_terminal() {
             return Err(Failure::Input("watch draws on a terminal, and this is none".to_owned()));
         }
-        let stop = Arc::new(AtomicBool::new(false));
         let runtime = tokio_runtime()?;
-        let stopping = Arc::clone(&stop);
-        runtime.spawn(async move {
-            asked_to_stop().await;
-            stopping.store(true, Ordering::Relaxed);
-        });
+        let stop = stop_when_asked(&runtime);
         let settings = client_settings(&config, &self.connect);
         let bus = runtime.block_on(async { ZenohBus::open(&settings) })?;
         let watched = terminal::run(&bus, &config.publish.prefix, self.bed.as_deref(), &self.author, &stop);

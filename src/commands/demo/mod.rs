@@ -20,7 +20,7 @@ use hemostream::edge::scoreboard::Scoreboard;
 use hemostream::edge::zenoh::ZenohBus;
 
 use super::dashboard::{ADDRESS, Link, bind};
-use super::serve::{Running, asked_to_stop, tokio_runtime};
+use super::serve::{Running, stop_when_asked, tokio_runtime};
 use super::simulate::positive;
 use super::{Failure, failed, say};
 
@@ -87,13 +87,8 @@ impl Demo {
         let client =
             ZenohSettings { mode: ZenohMode::Client, listen: Vec::new(), connect: config.zenoh.listen.clone() };
 
-        let stop = Arc::new(AtomicBool::new(false));
         let runtime = tokio_runtime()?;
-        let stopping = Arc::clone(&stop);
-        runtime.spawn(async move {
-            asked_to_stop().await;
-            stopping.store(true, Ordering::Relaxed);
-        });
+        let stop = stop_when_asked(&runtime);
         runtime.block_on(async {
             let listener = self.listener().await?;
             let daemon = ZenohBus::open(&config.zenoh)?;
