@@ -65,6 +65,22 @@ def drawn(page: Page) -> dict[str, Any]:
     return until(look, 10.0, "bands of all six pressures")
 
 
+DIFFERENCE = """() => {
+  const canvases = [...document.querySelectorAll('.strip canvas')];
+  const pixels = () => canvases.map((c) => c.getContext('2d').getImageData(0, 0, c.width, c.height).data);
+  const differs = (one, other, i) => [0, 1, 2].some((k) => Math.abs(one[i + k] - other[i + k]) > 24);
+  const before = pixels();
+  const painted = window.hemostream.drawn;
+  const after = pixels();
+  return Object.fromEntries(canvases.map((canvas, c) => {
+    let count = 0;
+    for (let i = 0; i < after[c].length; i += 4) if (differs(before[c], after[c], i)) count += 1;
+    return [canvas.dataset.testid, (4 * count) / after[c].length];
+  }));
+}"""
+"""Share of the pixels of every strip that are not what they are when all is painted anew."""
+
+
 class BrowserCase(unittest.TestCase):
     """A person in front of a dashboard; whatever the test does, the page must not complain nor talk to others."""
 
@@ -129,6 +145,16 @@ class Watching(DemoCase):
 
         until(moved, 10.0, "two seconds and twenty pictures more")
         self.assertGreater(account(page)["drawn"]["p_a"]["right"], before["drawn"]["p_a"]["right"] + 1.0)
+
+    def test_what_is_painted_bit_by_bit_is_what_is_painted_at_once(self) -> None:
+        page = self.open(f"#bed/{CALM_BED}")
+        for span_s, key in ((10, "3"), (2, "1"), (60, "5")):
+            page.keyboard.press(key)
+            drawn(page)
+            # More than a sweep over the screen, where that is not long.
+            time.sleep(min(1.2 * span_s, 12.0))
+            for name, share in page.evaluate(DIFFERENCE).items():
+                self.assertLess(share, 0.01, f"{name} at {span_s} s")
 
     def test_bands_are_drawn_and_hold_the_truth(self) -> None:
         # The estimator starts 50 % wrong about two parameters; ten seconds later none of that is in the picture.
@@ -208,6 +234,16 @@ class Watching(DemoCase):
         # Whoever opens the bed later reads it too.
         other = self.open(f"#bed/{CALM_BED}")
         until(lambda: other.get_by_test_id("event-log").get_by_text(note).count(), 10.0, "the note on another page")
+
+    def test_a_note_that_is_not_taken_stays_and_says_why(self) -> None:
+        page = self.open("#bed/nobody")
+        until(lambda: page.locator("#bed-unknown").is_visible(), 10.0, "a bed that nobody knows")
+        page.get_by_test_id("note-text").fill("adrenaline")
+        page.get_by_test_id("note-send").click()
+        until(lambda: "nobody" in (page.locator("#note-answer").text_content() or ""), 10.0, "a refusal")
+        self.assertIn("failed: bed: found \"nobody\"", page.locator("#note-answer").text_content() or "")
+        self.assertEqual(page.get_by_test_id("note-text").input_value(), "adrenaline")
+        self.assertTrue(page.get_by_test_id("note-send").is_enabled())
 
     def test_what_is_shown_downloads_as_csv(self) -> None:
         page = self.open(f"#bed/{CALM_BED}")

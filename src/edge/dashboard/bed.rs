@@ -573,3 +573,26 @@ fn spread(columns: &[Option<usize>], row: &[f64]) -> Vec<Spread> {
 pub(super) fn seconds(ns: i64) -> f64 {
     ns as f64 * 1e-9
 }
+
+/// Event time: of day if it counts from 1970, else seconds since whatever it counts from.
+pub(super) fn event_time(time_ns: i64) -> String {
+    const YEAR_2001_NS: i64 = 1_000_000_000_000_000_000;
+    if time_ns < YEAR_2001_NS {
+        return format!("{:.1} s", seconds(time_ns));
+    }
+    let tenths = time_ns / 100_000_000;
+    let (second, tenth) = (tenths / 10 % 86_400, tenths % 10);
+    format!("{:02}:{:02}:{:02}.{tenth} UTC", second / 3600, second / 60 % 60, second % 60)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn event_time_is_of_day_or_since_the_start() {
+        assert_eq!(event_time(12_340_000_000), "12.3 s");
+        assert_eq!(event_time(1_700_000_000_500_000_000), "22:13:20.5 UTC");
+        assert_eq!(event_time(i64::MIN), "-9223372036.9 s");
+    }
+}

@@ -4,7 +4,7 @@ use ratatui::buffer::Buffer;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
 
-use super::super::bed::{Bed, seconds};
+use super::super::bed::{Bed, event_time, seconds};
 use super::super::ward::Ward;
 use super::paper::{panel, put, put_right, wrap};
 use super::{style, urgency};
@@ -147,5 +147,5 @@ fn details(alarm: &Alarm, width: usize) -> Vec<String> {
         return Vec::new();
     }
     let priority = if urgency::is_raised(alarm) { format!("{} since", alarm.priority) } else { "since".to_owned() };
-    wrap(&format!("{priority} {}: {}", style::event_time(alarm.since_ns), alarm.text), width)
+    wrap(&format!("{priority} {}: {}", event_time(alarm.since_ns), alarm.text), width)
 }

@@ -7,7 +7,7 @@ use ratatui::layout::Rect;
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 
-use super::super::bed::{Bed, FORECAST_AFTER_S, Liveness, seconds};
+use super::super::bed::{Bed, FORECAST_AFTER_S, Liveness, event_time, seconds};
 use super::super::ward::Ward;
 use super::order::listed;
 use super::paper::{put, put_right};
@@ -111,7 +111,7 @@ fn time_and_age(bed: &Bed, at: Duration, is_wide: bool) -> Line<'static> {
     let age = bed.age(at);
     let is_late = age.is_some_and(|age| age > LATE);
     let age = age.map_or(style::NONE.to_owned(), |age| style::duration(age.as_secs_f64()));
-    let time = bed.newest_ns(at).map_or(style::NONE.to_owned(), style::event_time);
+    let time = bed.newest_ns(at).map_or(style::NONE.to_owned(), event_time);
     Line::from(vec![
         Span::styled(if is_wide { "  event time " } else { "  t " }, style::QUIET),
         Span::styled(time, style::STRONG),

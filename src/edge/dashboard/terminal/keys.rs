@@ -6,6 +6,7 @@ use ratatui::buffer::Buffer;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
 
+use super::super::bed::event_time;
 use super::HISTORY_S;
 use super::paper::{panel, put, put_right};
 use super::prompt::{MAX_NOTE, Prompt, choices};
@@ -81,7 +82,7 @@ fn draw_prompt(buf: &mut Buffer, area: Rect, prompt: &Prompt) {
             let left = MAX_NOTE.saturating_sub(text.chars().count());
             let hint =
                 if left < 100 { format!("{left} left, Enter sends, Esc") } else { "Enter sends, Esc".to_owned() };
-            (format!("note on {} at {}", style::fit(bed, 12), style::event_time(time.0)), text.clone(), hint)
+            (format!("note on {} at {}", style::fit(bed, 12), event_time(time.0)), text.clone(), hint)
         }
         Prompt::Acknowledge { bed, alarms, at } => {
             let what = alarms.get(*at).cloned().unwrap_or_else(|| format!("all {}", alarms.len()));

@@ -5,7 +5,7 @@ use ratatui::layout::Rect;
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 
-use super::super::bed::{Bed, EventLine};
+use super::super::bed::{Bed, EventLine, event_time};
 use super::paper::{panel, put};
 use super::style;
 
@@ -56,7 +56,7 @@ fn look(kind: &str) -> Style {
 /// An event in one line.
 pub(super) fn line(event: &EventLine) -> Line<'static> {
     let mut spans = vec![
-        Span::styled(format!("{:>9}  ", style::event_time(event.time_ns)), style::QUIET),
+        Span::styled(format!("{:>9}  ", event_time(event.time_ns)), style::QUIET),
         Span::styled(event.kind.replace('_', " "), look(&event.kind)),
     ];
     if !event.channel.is_empty() {

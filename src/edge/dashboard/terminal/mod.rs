@@ -7,7 +7,6 @@
 mod alarms;
 mod bedside;
 mod columns;
-mod errand;
 mod group;
 mod header;
 mod health;
@@ -39,8 +38,8 @@ use std::time::Duration;
 use ratatui::DefaultTerminal;
 use ratatui::crossterm::event::{self, Event};
 
-use self::errand::{Errand, Outcome};
 use self::ui::{Next, Ui};
+use super::errand::{self, Errand, Outcome};
 use super::feed::{self, QUEUE, Topics};
 use super::ward::{Memory, Ward};
 use crate::edge::bus::{Bus, Message};

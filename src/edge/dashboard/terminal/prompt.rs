@@ -2,7 +2,7 @@
 
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
-use super::errand::Errand;
+use super::super::errand::Errand;
 use crate::estimate::time::EventTime;
 
 /// Longest note \[characters\].
@@ -73,7 +73,7 @@ impl Prompt {
     fn answer(&self) -> Reply {
         match self {
             Self::Note { bed, time, text } if !text.trim().is_empty() => {
-                Reply::Errand(Errand::Note { bed: bed.clone(), time: *time, text: text.trim().to_owned() })
+                Reply::Errand(Errand::Note { bed: bed.clone(), time: Some(*time), text: text.trim().to_owned() })
             }
             Self::Acknowledge { bed, alarms, at } => {
                 Reply::Errand(Errand::Acknowledge { bed: bed.clone(), alarm: alarms.get(*at).cloned() })
@@ -126,7 +126,7 @@ mod tests {
         press(&mut prompt, KeyCode::Char(' '));
         assert_eq!(press(&mut prompt, KeyCode::Enter), Reply::Closed { is_withdrawn: false });
         press(&mut prompt, KeyCode::Char('x'));
-        let errand = Errand::Note { bed: "bed1".to_owned(), time: EventTime(7), text: "x".to_owned() };
+        let errand = Errand::Note { bed: "bed1".to_owned(), time: Some(EventTime(7)), text: "x".to_owned() };
         assert_eq!(press(&mut prompt, KeyCode::Enter), Reply::Errand(errand));
     }
 

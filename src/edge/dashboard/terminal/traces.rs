@@ -7,7 +7,7 @@ use ratatui::layout::Rect;
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 
-use super::super::bed::{Band, Bed, FORECAST_AFTER_S, Liveness, Origin, quantity_names};
+use super::super::bed::{Band, Bed, FORECAST_AFTER_S, Liveness, Origin, event_time, quantity_names};
 use super::group::Group;
 use super::paper::{DOTS_X, DOTS_Y, Ink, Raster, panel, put, put_right};
 use super::style;
@@ -187,7 +187,7 @@ fn draw_time_axis(buf: &mut Buffer, area: Rect, span_s: u32, end_ns: Option<i64>
         let mark = Rect { x: area.x + cells as u16, ..area }.intersection(area);
         put(buf, mark, 0, Span::styled(format!("╵-{back} s"), style::QUIET));
     }
-    let (end, look) = end_ns.map_or(("now".to_owned(), style::QUIET), |t| (style::event_time(t), style::WARNING));
+    let (end, look) = end_ns.map_or(("now".to_owned(), style::QUIET), |t| (event_time(t), style::WARNING));
     put_right(buf, area, 0, Span::styled(format!("{end}╵"), look));
 }
 

@@ -5,9 +5,9 @@ use std::time::Duration;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyEventKind, KeyModifiers};
 
 use super::super::bed::Bed;
+use super::super::errand::{Errand, Outcome};
 use super::super::ward::Ward;
 use super::HISTORY_S;
-use super::errand::{Errand, Outcome};
 use super::group::Group;
 use super::order::{Order, listed, natural};
 use super::pause::Frozen;

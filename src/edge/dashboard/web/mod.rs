@@ -16,6 +16,7 @@ mod frame;
 mod hub;
 mod live;
 mod metrics;
+mod orders;
 mod picture;
 mod snapshot;
 

@@ -3,7 +3,7 @@
 use std::sync::mpsc::sync_channel;
 use std::sync::{Arc, Mutex};
 
-use super::super::errand::{self, Errand, Outcome};
+use super::super::super::errand::{self, Errand, Outcome};
 use super::*;
 use crate::edge::bus::{Bus, MemoryBus};
 use crate::edge::wire::Acknowledge;
@@ -68,7 +68,7 @@ fn a_note_is_about_what_was_on_the_screen_when_it_was_begun() {
     ward.apply(&state("bed1", 12_000 * MS, 0.0), 12 * SECOND);
     assert_shows(&last_line(&ward, &ui), &["note on bed1 at 10.0 s", "q bolus▏", "Enter sends, Esc"]);
     let note = |ns: i64, text: &str| {
-        Next::Tell(Errand::Note { bed: "bed1".to_owned(), time: EventTime(ns), text: text.to_owned() })
+        Next::Tell(Errand::Note { bed: "bed1".to_owned(), time: Some(EventTime(ns)), text: text.to_owned() })
     };
     assert_eq!(press(&mut ui, &ward, KeyCode::Enter), note(9980 * MS, "q bolus"));
     press(&mut ui, &ward, KeyCode::Left);
@@ -152,7 +152,7 @@ fn errands_are_run_in_order_and_what_became_of_them_is_said() {
     let (sender, errands) = sync_channel(errand::QUEUE);
     let (outcome_sender, outcomes) = sync_channel(errand::QUEUE);
     let acknowledge = |bed: &str| Errand::Acknowledge { bed: bed.to_owned(), alarm: Some("a".to_owned()) };
-    let note = Errand::Note { bed: "bed1".to_owned(), time: EventTime(3000 * MS), text: "bolus".to_owned() };
+    let note = Errand::Note { bed: "bed1".to_owned(), time: Some(EventTime(3000 * MS)), text: "bolus".to_owned() };
     for errand in [acknowledge("bed1"), acknowledge("bed1"), note, acknowledge("bed9")] {
         sender.send(errand).unwrap();
     }

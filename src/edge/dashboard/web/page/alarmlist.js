@@ -1,7 +1,7 @@
 // The alarms of a bed: raised ones first, each with a button to say that it was seen; quiet ones with their limits.
 
 import { byUrgency, isRaised, signOf } from "./alarms.js";
-import { byId, element, setAttribute, setText } from "./dom.js";
+import { byId, element, setAttribute, setHidden, setText } from "./dom.js";
 import { labelOf } from "./names.js";
 import { decimals, number, range } from "./numbers.js";
 import { clockText, secondsOf } from "./time.js";
@@ -15,7 +15,16 @@ export class AlarmList {
     this.all = byId("acknowledge-all");
     this.onAcknowledge = onAcknowledge;
     this.shown = null;
-    this.all.addEventListener("click", () => onAcknowledge(""));
+    this.all.addEventListener("click", () => this.#acknowledge(""));
+  }
+
+  /** Says how an acknowledgement ended: the list itself shows one that the daemon has taken. */
+  answer({ ok, text }) {
+    setText(byId("alarm-answer"), ok ? "" : text);
+  }
+
+  #acknowledge(name) {
+    setText(byId("alarm-answer"), this.onAcknowledge(name) ? "" : "Not sent: the connection is lost.");
   }
 
   /** Shows the alarms; a list that did not change is left alone, so that no button moves away under the pointer. */
@@ -28,8 +37,8 @@ export class AlarmList {
     const focused = this.list.contains(document.activeElement) ? document.activeElement.dataset.alarm : null;
     this.list.replaceChildren(...[...raised, ...others].slice(0, SHOWN_LIMIT).map((alarm) => this.#item(alarm)));
     if (focused !== null) [...this.list.querySelectorAll("button")].find((b) => b.dataset.alarm === focused)?.focus();
-    this.all.hidden = !raised.some((alarm) => !alarm.acknowledged);
-    byId("no-alarms").hidden = alarms.length > 0;
+    setHidden(this.all, !raised.some((alarm) => !alarm.acknowledged));
+    setHidden(byId("no-alarms"), alarms.length > 0);
     this.#announce(raised);
   }
 
@@ -56,9 +65,7 @@ export class AlarmList {
   #button(name) {
     const attributes = { type: "button", "data-alarm": name, "aria-label": `Acknowledge ${name}`, text: "Acknowledge" };
     const button = element("button", attributes);
-    button.addEventListener("click", () => {
-      if (!this.onAcknowledge(name)) button.textContent = "Not sent";
-    });
+    button.addEventListener("click", () => this.#acknowledge(name));
     return button;
   }
 }

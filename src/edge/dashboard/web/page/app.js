@@ -3,7 +3,7 @@
 import { Bed } from "./bed.js";
 import { startCommands } from "./commands.js";
 import { Connection } from "./connection.js";
-import { byId, setAttribute, setText } from "./dom.js";
+import { byId, setAttribute, setHidden, setText } from "./dom.js";
 import { save } from "./export.js";
 import { decodeFrame } from "./frame.js";
 import { Meter } from "./meter.js";
@@ -16,13 +16,16 @@ const SPAN_KEYS = "12345";
 /** An arrow key goes by so much of what is shown. */
 const STEP_SPANS = 0.25;
 
+/** Time between two pictures of a bed [ms]. */
+const PICTURE_EVERY_MS = 45;
+
 const meter = new Meter();
 let view = "ward";
 let isDue = false;
 
 startTheme(byId("theme"));
 const ward = new Ward();
-const connection = new Connection({ onFrame: takeFrame, onState: showConnection });
+const connection = new Connection({ onFrame: takeFrame, onText: takeText, onState: showConnection });
 const bed = new Bed({ show: (wish) => connection.show(wish), send: (order) => connection.send(order), changed: requestDraw });
 
 function takeFrame(buffer) {
@@ -32,12 +35,17 @@ function takeFrame(buffer) {
     else if (head.kind === "bed" && view === "bed") bed.take(head, numbers);
     else return;
     showBus(head.connected);
-    byId("misread").hidden = true;
+    setHidden(byId("misread"), true);
   } catch (error) {
     setText(byId("misread"), `A frame of the server was not understood: ${error.message}`);
-    byId("misread").hidden = false;
+    setHidden(byId("misread"), false);
   }
-  requestDraw();
+  if (view === "ward") requestDraw();
+}
+
+function takeText(text) {
+  const message = JSON.parse(text);
+  if (message.kind === "answer") bed.answer(message);
 }
 
 // One picture at most is due, of whatever is newest by then: a slow browser skips pictures instead of falling behind.
@@ -47,20 +55,25 @@ function requestDraw() {
   requestAnimationFrame((now) => {
     isDue = false;
     if (view === "ward") ward.draw();
-    else bed.draw(now);
-    meter.tick(now);
+    if (view === "ward" || bed.draw(now)) meter.tick(now);
   });
 }
+
+// Waveforms go on between two frames of the server; they are shown a little later than they come, and evenly.
+setInterval(() => {
+  if (view === "bed" && !document.hidden) requestDraw();
+}, PICTURE_EVERY_MS);
 
 function showConnection(state) {
   setAttribute(byId("connection"), "data-state", state);
   setText(byId("connection"), state === "open" ? "● connected" : "✕ lost");
   document.body.dataset.connection = state;
   byId("lost").hidden = state === "open";
+  if (state === "lost") bed.lose();
 }
 
 function showBus(isConnected) {
-  byId("bus").hidden = isConnected !== false;
+  setHidden(byId("bus"), isConnected !== false);
 }
 
 setInterval(() => {

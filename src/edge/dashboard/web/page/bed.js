@@ -1,10 +1,10 @@
-// A bed: keeps its history and lets the panels show it. Strips are drawn with every frame, numbers four times a second,
-// charts about once.
+// A bed: keeps its history and lets the panels show it. Strips go on with every frame, numbers four times a second, charts
+// about once.
 
 import { AlarmList } from "./alarmlist.js";
 import { badge, byUrgency } from "./alarms.js";
 import { Charts } from "./charts.js";
-import { byId, setAttribute, setText } from "./dom.js";
+import { byId, setAttribute, setHidden, setText } from "./dom.js";
 import { EventLog } from "./eventlog.js";
 import { fileName, save, stripsCsv, stripsPng } from "./export.js";
 import { writeHealth } from "./health.js";
@@ -13,6 +13,7 @@ import { isCurrent, livenessText, outageText, qualityText } from "./liveness.js"
 import { addLoops } from "./loops.js";
 import { markersOf } from "./markers.js";
 import { Numerics } from "./numerics.js";
+import { isInSight, watch } from "./sight.js";
 import { Sources } from "./sources.js";
 import { Strips } from "./strips.js";
 import { nsOf } from "./time.js";
@@ -23,6 +24,8 @@ import { Viewport } from "./viewport.js";
 /** Points of a waveform need not be closer than this [ms]. */
 const SPACING_MS = 8;
 const WRITE_EVERY_MS = 250;
+/** What is out of sight is written with one of so many writes: somebody may have it read out. */
+const WRITES_PER_UNSEEN = 8;
 
 export class Bed {
   /** `show(wish)` and `send(order)` reach the server, `changed()` asks for a picture. */
@@ -35,6 +38,7 @@ export class Bed {
     this.head = null;
     this.newestNs = null;
     this.writtenAt = -Infinity;
+    this.markers = [];
     this.viewport = new Viewport();
     this.timeline = new Timeline(this.viewport);
     this.strips = new Strips({ onChoice: () => this.#ask(), onResize: changed });
@@ -47,6 +51,8 @@ export class Bed {
     this.alarms = new AlarmList({ onAcknowledge: (alarm) => send({ acknowledge: alarm, bed: this.name }) });
     this.events = new EventLog({ onNote: (text, author) => this.#note(text, author) });
     this.viewport.onChange(() => this.#redraw());
+    this.writes = 0;
+    for (const panel of this.#panels()) watch(panel.node);
   }
 
   /** Shows another bed from now on. */
@@ -56,8 +62,7 @@ export class Bed {
     this.newestNs = null;
     this.history = new History(this.strips.quantities());
     for (const panel of [this.strips, this.trends, this.sources]) panel.reset();
-    this.viewport.follow(0, 0);
-    this.viewport.live();
+    this.viewport.reset();
     setAttribute(this.node, "data-bed", name);
     setAttribute(this.node, "data-liveness", "");
     setText(byId("bed-name"), name);
@@ -82,34 +87,52 @@ export class Bed {
     this.head = head;
     this.newestNs = head.now_ns ?? null;
     const now = this.history.now ?? 0;
-    this.viewport.follow(this.history.oldest ?? now, now);
+    this.viewport.follow(this.history.oldest ?? now, now, performance.now());
     if (this.viewport.isPaused && this.viewport.edge > now) this.viewport.live();
   }
 
-  /** Draws the strips, and from time to time writes the numbers. */
-  draw(now) {
-    this.markers = markersOf(this.history);
-    this.strips.draw(this.history, this.viewport, this.markers);
-    if (now - this.writtenAt < WRITE_EVERY_MS) return;
-    this.writtenAt = now;
-    this.#write();
+  /** Takes the answer to an order that was sent. */
+  answer(message) {
+    if (message.order === "note") this.events.answer(message);
+    else this.alarms.answer(message);
   }
 
-  /** What was painted of each quantity, for tests. */
+  /** The line is lost, and with it what was under way. */
+  lose() {
+    this.events.answer({ ok: false, text: "The connection is lost; whether the note was taken is not known." });
+  }
+
+  /** Draws the strips up to `now` [ms], and from time to time writes the numbers. Returns whether a waveform went on. */
+  draw(now) {
+    this.viewport.advance(now);
+    const isDue = now - this.writtenAt >= WRITE_EVERY_MS;
+    if (isDue) this.markers = markersOf(this.history);
+    const isNew = this.strips.draw(this.history, this.viewport, this.markers);
+    if (isDue) {
+      this.writtenAt = now;
+      this.#write();
+    }
+    return isNew;
+  }
+
+  /** Draws the strips anew and says what was painted of each quantity, for tests. */
   drawn() {
-    return Object.fromEntries([...this.strips].filter((strip) => strip.account).map((strip) => [strip.name, { ...strip.account }]));
+    return this.strips.drawAnew(this.history, this.viewport, this.markers);
   }
 
   /** Hands out what is shown as a file. */
   async export(ending) {
     const name = fileName(this.name, this.viewport.right, ending);
-    if (ending === "png") return save(await stripsPng(this.name, this.viewport, this.strips), name);
+    if (ending === "png") {
+      const pictures = [...this.strips.stretched(this.history, this.viewport, this.markers)];
+      return save(await stripsPng(this.name, this.viewport, pictures), name);
+    }
     const names = [...this.strips].map((strip) => strip.name);
     return save(new Blob([stripsCsv(this.history, this.viewport, names)], { type: "text/csv" }), name);
   }
 
   #scene() {
-    return { history: this.history, viewport: this.viewport, markers: this.markers ?? [] };
+    return { history: this.history, viewport: this.viewport, markers: this.markers };
   }
 
   #ask() {
@@ -120,6 +143,7 @@ export class Bed {
 
   #redraw() {
     this.writtenAt = -Infinity;
+    this.writes = 0;
     this.changed();
   }
 
@@ -140,11 +164,22 @@ export class Bed {
     setText(byId("strips-stale"), current ? "" : outageText(this.head));
     this.numerics.write((key) => (current ? (history.beatAt(key, viewport.right) ?? liveOnly(viewport, latest.beat?.[key])) : null));
     this.strips.write(history, viewport, current);
-    this.trends.write(history, viewport);
-    this.sources.write(latest.quantities ?? []);
     this.events.write(history.events);
     this.alarms.write(latest.alarms ?? []);
-    writeHealth(latest.status ?? null);
+    const isForAll = this.writes % WRITES_PER_UNSEEN === 0;
+    this.writes += 1;
+    for (const panel of this.#panels()) if (isForAll || isInSight(panel.node)) panel.write();
+  }
+
+  // Panels of many numbers, most of which are below what a screen shows.
+  #panels() {
+    const { latest } = this.history;
+    return [
+      { node: byId("beat-trends"), write: () => this.trends.write("beats", this.history, this.viewport) },
+      { node: byId("parameter-trends"), write: () => this.trends.write("parameters", this.history, this.viewport) },
+      { node: byId("sources"), write: () => this.sources.write(latest.quantities ?? []) },
+      { node: byId("health-panel"), write: () => writeHealth(latest.status ?? null) },
+    ];
   }
 
   #writeHead() {
@@ -155,7 +190,7 @@ export class Bed {
     setAttribute(byId("bed-liveness"), "data-liveness", liveness);
     setText(byId("bed-quality"), head ? qualityText(head) : "");
     setAttribute(byId("bed-quality"), "data-quality", head?.quality ?? "");
-    byId("bed-unknown").hidden = head?.known !== false;
+    setHidden(byId("bed-unknown"), head?.known !== false);
     const raised = byUrgency(this.history.latest.alarms);
     const key = JSON.stringify(raised.slice(0, 2));
     if (byId("bed-alarms").dataset.key !== key) {

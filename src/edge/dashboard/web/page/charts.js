@@ -1,15 +1,16 @@
 // Charts by plotly: fetched when the first one is needed, then drawn in turns, one at a time, so that no redraw holds up
 // the strips. Charts that nobody sees are not drawn.
 
+import { isInSight, unwatch, watch } from "./sight.js";
 import { color, onTheme } from "./theme.js";
 
-/** Between two charts; with about six charts in sight each is a second old at most. */
+/** Between two charts; with about six charts in sight each is two seconds old at most. */
 const TURN_MS = 160;
 /** A chart is not drawn more often than this. */
-const LEAST_AGE_MS = 900;
+const LEAST_AGE_MS = 1500;
 
 /** After a chart the strips have the machine for so many times as long as it took. */
-const REST = 5;
+const REST = 8;
 
 let plotly = null;
 
@@ -29,9 +30,6 @@ export class Charts {
     this.charts = new Set();
     this.isOn = false;
     this.restUntil = 0;
-    this.observer = new IntersectionObserver((entries) => {
-      for (const { target, isIntersecting } of entries) target.isInSight = isIntersecting;
-    });
     onTheme(() => {
       for (const chart of this.charts) chart.drawnAt = -Infinity;
     });
@@ -42,14 +40,14 @@ export class Charts {
   add(node, figure) {
     const chart = { node, figure, drawnAt: -Infinity };
     this.charts.add(chart);
-    this.observer.observe(node);
+    watch(node);
     return chart;
   }
 
   /** Takes a chart away. */
   remove(chart) {
     this.charts.delete(chart);
-    this.observer.unobserve(chart.node);
+    unwatch(chart.node);
     if (chart.isDrawn) window.Plotly.purge(chart.node);
   }
 
@@ -61,7 +59,7 @@ export class Charts {
   #turn() {
     const now = performance.now();
     if (!this.isOn || document.hidden || now < this.restUntil) return;
-    const due = [...this.charts].filter((chart) => chart.node.isInSight && now - chart.drawnAt > LEAST_AGE_MS);
+    const due = [...this.charts].filter((chart) => isInSight(chart.node) && now - chart.drawnAt > LEAST_AGE_MS);
     if (!due.length) return;
     const chart = due.reduce((one, other) => (other.drawnAt < one.drawnAt ? other : one));
     chart.drawnAt = now;
@@ -76,7 +74,7 @@ export class Charts {
     draw(Plotly, chart);
     const end = performance.now();
     // A chart that was never drawn is an empty frame; the strips can wait for these few.
-    const isBlank = [...this.charts].some((c) => c.node.isInSight && !c.isDrawn && c.drawnAt === -Infinity);
+    const isBlank = [...this.charts].some((c) => isInSight(c.node) && !c.isDrawn && c.drawnAt === -Infinity);
     this.restUntil = isBlank ? 0 : end + REST * (end - begin);
   }
 }

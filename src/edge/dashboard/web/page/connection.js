@@ -6,9 +6,10 @@ const LONGEST_WAIT_MS = 5000;
 const SILENCE_MS = 6000;
 
 export class Connection {
-  /** `onFrame(buffer)` gets every binary frame, `onState("open" | "lost")` every change. */
-  constructor({ onFrame, onState }) {
+  /** `onFrame(buffer)` gets every binary frame, `onText(text)` every text, `onState("open" | "lost")` every change. */
+  constructor({ onFrame, onText, onState }) {
     this.onFrame = onFrame;
+    this.onText = onText;
     this.onState = onState;
     this.state = "lost";
     this.socket = null;
@@ -58,6 +59,7 @@ export class Connection {
     this.waitMs = LEAST_WAIT_MS;
     this.#become("open");
     if (message.data instanceof ArrayBuffer) this.onFrame(message.data);
+    else this.onText(message.data);
   }
 
   #lose(socket) {

@@ -22,6 +22,11 @@ export function setAttribute(node, name, value) {
   if (node.getAttribute(name) !== value) node.setAttribute(name, value);
 }
 
+/** The same for whether it is hidden. */
+export function setHidden(node, isHidden) {
+  if (node.hidden !== isHidden) node.hidden = isHidden;
+}
+
 /** The element of the page with this id. */
 export const byId = (id) => document.getElementById(id);
 

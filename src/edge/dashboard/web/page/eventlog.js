@@ -16,7 +16,8 @@ export class EventLog {
     this.list = byId("event-log");
     this.text = byId("note-text");
     this.author = byId("note-author");
-    this.answer = byId("note-answer");
+    this.said = byId("note-answer");
+    this.button = byId("note-send");
     this.author.value = recall("author", "");
     this.shown = null;
     byId("note").addEventListener("submit", (event) => {
@@ -35,13 +36,21 @@ export class EventLog {
     this.list.replaceChildren(...sorted.map(itemOf));
   }
 
+  /** Says how the note that was sent ended; one that nobody took stays in its field. */
+  answer({ ok, text }) {
+    if (!this.button.disabled) return;
+    this.button.disabled = false;
+    setText(this.said, ok ? "" : text);
+    if (ok) this.text.value = "";
+  }
+
   #send(onNote) {
     const text = this.text.value.trim();
-    if (!text) return;
+    if (!text || this.button.disabled) return;
     remember("author", this.author.value.trim());
     const isSent = onNote(text, this.author.value.trim());
-    setText(this.answer, isSent ? "" : "Not sent: the connection is lost.");
-    if (isSent) this.text.value = "";
+    this.button.disabled = isSent;
+    setText(this.said, isSent ? "" : "Not sent: the connection is lost.");
   }
 }
 

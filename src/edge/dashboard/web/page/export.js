@@ -67,12 +67,11 @@ const SAME_TIME_S = 2e-5;
 const HEAD_PX = 34;
 const NUMBERS_PX = 190;
 
-/** The strips as a picture, with the bed, the time and the numbers on it. */
-export function stripsPng(bed, viewport, strips) {
+/** Strips and pictures of them on one picture, with the bed, the time and the numbers. */
+export function stripsPng(bed, viewport, pictures) {
   const ratio = window.devicePixelRatio || 1;
-  const shown = [...strips];
-  const width = Math.max(...shown.map((strip) => strip.width)) + NUMBERS_PX;
-  const height = HEAD_PX + shown.reduce((sum, strip) => sum + strip.height + 6, 0);
+  const width = Math.max(...pictures.map(([strip]) => strip.width)) + NUMBERS_PX;
+  const height = HEAD_PX + pictures.reduce((sum, [strip]) => sum + strip.height + 6, 0);
   const canvas = element("canvas", { width: Math.round(width * ratio), height: Math.round(height * ratio) });
   const ctx = canvas.getContext("2d");
   ctx.scale(ratio, ratio);
@@ -83,11 +82,11 @@ export function stripsPng(bed, viewport, strips) {
     ctx.font = `${font} system-ui, sans-serif`;
     ctx.fillText(text, x, y);
   };
-  const when = `${clockText(viewport.left)} to ${clockText(viewport.right)}${viewport.isPaused ? ", paused" : ""}`;
+  const when = `${clockText(viewport.right - viewport.span)} to ${clockText(viewport.right)}${viewport.isPaused ? ", paused" : ""}`;
   write(`${bed}   ${when}   lines: mean, bands: 5–95 %`, 10, 22, "600 14px", color("ink"));
   let y = HEAD_PX;
-  for (const strip of shown) {
-    ctx.drawImage(strip.canvas, 0, y, strip.width, strip.height);
+  for (const [strip, picture] of pictures) {
+    ctx.drawImage(picture, 0, y, strip.width, strip.height);
     const x = strip.width + 10;
     write(`${strip.about.label}  ${strip.origin.textContent}`, x, y + 16, "600 12px", color("ink"));
     write(`${strip.main.textContent} ${strip.side.textContent}`, x, y + 38, "600 18px", color(strip.about.color));

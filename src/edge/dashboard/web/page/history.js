@@ -16,9 +16,14 @@ const EVENTS_LIMIT = 500;
 /** Event time that goes back by more than this began anew [s]. */
 const JUMP_BACK_S = 1;
 
+/** Parts that strips are painted of. */
+const WAVEFORMS = ["estimate", "truth", "samples"];
+
 const BAND = ["mean", "low", "high"];
 
 export class History {
+  #changedFrom;
+
   constructor(quantities) {
     this.now = null;
     this.estimate = new Series([], ESTIMATE_LIMIT);
@@ -30,13 +35,22 @@ export class History {
     this.events = [];
     /** What came last of the things sent twice a second: quantities, parameters, beat, alarms, status. */
     this.latest = {};
+    this.#changedFrom = Infinity;
     this.show(quantities);
+  }
+
+  /** Time from which on waveforms are not what they were when this was last asked; infinite if nothing has changed. */
+  takeChange() {
+    const from = this.#changedFrom;
+    this.#changedFrom = Infinity;
+    return from;
   }
 
   /** Quantities whose waveforms are kept from now on. */
   show(quantities) {
     this.estimate.setColumns(["since_data", ...quantities.flatMap((q) => BAND.map((part) => `${q}.${part}`))]);
     this.truth.setColumns(quantities);
+    this.#changedFrom = -Infinity;
   }
 
   /** Takes in a bed frame. Throws if it is not laid out as the protocol says. */
@@ -76,6 +90,7 @@ export class History {
     this.latest = {};
     if (now !== null && this.now !== null && now > this.now - JUMP_BACK_S) return;
     this.now = null;
+    this.#changedFrom = -Infinity;
     for (const series of this.#all()) series.clear();
   }
 
@@ -95,6 +110,10 @@ export class History {
     if (!series) return;
     const offsets = part.rows[0];
     if (isReset) series.truncateFrom(origin + offsets[0]);
+    if (WAVEFORMS.includes(part.part)) {
+      // A line goes on from the row before.
+      this.#changedFrom = Math.min(this.#changedFrom, series.newest ?? -Infinity, origin + offsets[0]);
+    }
     series.append(origin, offsets, values);
   }
 

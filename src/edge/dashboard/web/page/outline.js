@@ -42,3 +42,18 @@ export function bandOf(series, low, high, from, to, stride) {
   });
   return band;
 }
+
+/** A line in dashes of `on` seconds with `off` between them: pieces `[time, value, time, value]`. Where a dash is only
+ * its time decides. */
+export function dashes(line, on, off) {
+  const pieces = [];
+  for (let k = 2; k < line.length; k += 2) {
+    const [t0, v0, t1, v1] = line.slice(k - 2, k + 2);
+    const valueAt = (time) => (t1 > t0 ? v0 + ((time - t0) / (t1 - t0)) * (v1 - v0) : v1);
+    for (let start = Math.floor(t0 / (on + off)) * (on + off); start < t1; start += on + off) {
+      const [from, to] = [Math.max(t0, start), Math.min(t1, start + on)];
+      if (from < to) pieces.push([from, valueAt(from), to, valueAt(to)]);
+    }
+  }
+  return pieces;
+}

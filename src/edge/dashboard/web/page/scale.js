@@ -33,12 +33,16 @@ export class Scale {
     this.isSet = false;
   }
 
+  /** Whether an extent has room. */
+  holds(wanted) {
+    return this.isSet && (!wanted || (wanted.low >= this.low && wanted.high <= this.high));
+  }
+
   /** Makes room for an extent. */
   fit(wanted) {
     if (!wanted) return;
-    const isOutside = wanted.low < this.low || wanted.high > this.high;
     const isEmpty = wanted.high - wanted.low < LEAST_USE * (this.high - this.low);
-    if (this.isSet && !isOutside && !isEmpty) return;
+    if (this.holds(wanted) && !isEmpty) return;
     const margin = 0.08 * Math.max(wanted.high - wanted.low, LEAST_SPAN);
     [this.low, this.high] = [wanted.low - margin, wanted.high + margin];
     this.ticks = niceTicks(this.low, this.high, TICKS).ticks;

@@ -3,20 +3,26 @@
 import { element, setAttribute, setText } from "./dom.js";
 import { describe } from "./names.js";
 import { decimals, NONE, number, spread } from "./numbers.js";
-import { paintStrip } from "./paint.js";
+import { paintAxis, paintRegion } from "./paint.js";
 import { paletteOf } from "./palette.js";
 import { pressureReading } from "./readings.js";
 import { extent, Scale } from "./scale.js";
+import { shareInside } from "./truth.js";
 
 const ORIGINS = { observed: "● observed", silent: "◌ sensor silent", inferred: "◇ inferred" };
+
+/** Time between two looks whether the scale is too wide [s]. */
+const FIT_EVERY_S = 1;
 
 export class Strip {
   constructor(name) {
     this.name = name;
     this.about = describe(name);
     this.scale = new Scale();
-    this.account = null;
     this.span = 0;
+    this.paintedTo = -Infinity;
+    this.lookOfPainted = null;
+    this.fittedAt = -Infinity;
     this.canvas = element("canvas", { "data-testid": `strip-${name}`, role: "img" });
     this.origin = element("span", { class: "origin" });
     this.main = element("span", { class: "strip-main" });
@@ -43,6 +49,12 @@ export class Strip {
     return this.name.startsWith("p_");
   }
 
+  /** Forgets another bed. */
+  reset() {
+    this.scale.reset();
+    this.lookOfPainted = null;
+  }
+
   /** Takes the strip off the page. */
   remove() {
     this.resizing.disconnect();
@@ -50,30 +62,87 @@ export class Strip {
   }
 
   #resize() {
-    const ratio = window.devicePixelRatio || 1;
+    this.ratio = window.devicePixelRatio || 1;
     this.width = Math.max(this.plot.clientWidth, 60);
     this.height = Math.max(this.plot.clientHeight, 30);
-    this.canvas.width = Math.round(this.width * ratio);
-    this.canvas.height = Math.round(this.height * ratio);
+    this.canvas.width = Math.round(this.width * this.ratio);
+    this.canvas.height = Math.round(this.height * this.ratio);
+    this.lookOfPainted = null;
     this.onResize?.();
   }
 
-  /** Paints what the viewport shows. */
-  draw(history, viewport, options) {
+  /** Paints what is not on the canvas yet: what came after what was painted last or is not what it was any more, from
+   * `changedFrom` on, or everything where it looks different. Returns whether there was anything. `options` are
+   * `markers`, `withLabels`, `showSamples`, `showTruth`. */
+  draw(history, viewport, changedFrom, options) {
     if (!this.width) this.#resize();
-    const { left, right, span } = viewport;
+    this.#fit(history.estimate, viewport);
+    const picture = this.#picture(viewport, options);
+    const look = lookOf(picture, viewport);
+    const isSame = this.lookOfPainted !== null && look.every((part, k) => part === this.lookOfPainted[k]);
+    const from = isSame ? Math.min(changedFrom, this.paintedTo) : -Infinity;
+    if (from >= viewport.right) return false;
+    this.lookOfPainted = look;
+    this.paintedTo = viewport.right;
+    const ctx = this.#context(this.canvas);
+    if (!isSame) paintAxis(ctx, picture);
+    for (const region of viewport.regions()) {
+      if (region.to > from) paintRegion(ctx, history, this.name, { ...region, from: Math.max(region.from, from) }, picture);
+    }
+    return true;
+  }
+
+  /** Paints everything anew, and says what that was: rows of the estimate, how many have a band, the newest band,
+   * samples, the share of the truth within the band. For tests. */
+  drawAnew(history, viewport, options) {
+    this.lookOfPainted = null;
+    this.draw(history, viewport, -Infinity, options);
+    const { left, right } = viewport;
+    const account = { points: 0, bandPoints: 0, samples: 0, low: null, high: null, left, right };
+    const picture = this.#picture(viewport, options);
+    for (const region of viewport.regions()) {
+      const painted = paintRegion(this.#context(this.canvas), history, this.name, region, picture);
+      for (const key of ["points", "bandPoints", "samples"]) account[key] += painted[key];
+    }
+    const { estimate } = history;
+    const newest = estimate.at(right);
+    for (const part of ["low", "high"]) account[part] = newest < 0 ? null : (estimate.column(`${this.name}.${part}`)?.[newest] ?? null);
+    account.truthInside = options.showTruth ? shareInside(history, this.name, left, right) : null;
+    return account;
+  }
+
+  /** A picture of its own of the same time, from edge to edge. */
+  stretched(history, viewport, options) {
+    const canvas = element("canvas", { width: this.canvas.width, height: this.canvas.height });
+    const picture = { ...this.#picture(viewport, options), gap: 0 };
+    const ctx = this.#context(canvas);
+    paintAxis(ctx, picture);
+    for (const region of viewport.stretch()) paintRegion(ctx, history, this.name, region, picture);
+    return canvas;
+  }
+
+  #context(canvas) {
+    const ctx = canvas.getContext("2d", { alpha: false });
+    const [x, y] = [canvas.width / this.width, canvas.height / this.height];
+    ctx.setTransform(x, 0, 0, y, 0, 0);
+    return ctx;
+  }
+
+  #picture({ span, gap }, options) {
+    const { width, height, ratio, scale } = this;
+    return { ...options, span, gap, width, height, ratio, scale, palette: paletteOf(this.about.color) };
+  }
+
+  // Whether the scale is too wide is looked at now and then, whether it is too narrow whenever there is something new.
+  #fit(estimate, { left, right, span, isPaused }) {
+    if (!estimate.column(`${this.name}.mean`)) return;
     if (span !== this.span) this.scale.reset();
     this.span = span;
-    const { estimate } = history;
-    if (estimate.column(`${this.name}.mean`)) {
-      this.scale.fit(extent(estimate, this.name, estimate.lower(left), estimate.lower(right + 1e-6)));
-    }
-    const ctx = this.canvas.getContext("2d", { alpha: false });
-    const ratio = this.canvas.width / this.width;
-    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
-    this.account = paintStrip(ctx, history, this.name, {
-      ...options, left, right, width: this.width, height: this.height, scale: this.scale, palette: paletteOf(this.about.color),
-    });
+    const extentFrom = (time) => extent(estimate, this.name, estimate.lower(time), estimate.lower(right + 1e-6));
+    const isDue = isPaused || Math.abs(right - this.fittedAt) > FIT_EVERY_S || !this.scale.isSet;
+    if (!isDue && this.scale.holds(extentFrom(Math.max(left, this.paintedTo)))) return;
+    this.fittedAt = right;
+    this.scale.fit(extentFrom(left));
   }
 
   /** Writes the value at the right edge; a few times a second, or nobody could read it. */
@@ -111,4 +180,10 @@ export class Strip {
     setText(this.instant, was);
     setAttribute(this.canvas, "aria-label", `${this.about.text}: no current value`);
   }
+}
+
+/** What a picture looks like but for the waveform: where any of it is different nothing painted before can stay. */
+function lookOf({ width, height, ratio, scale, palette, showSamples, showTruth, markers }, { span, isPaused, right }) {
+  const marks = markers.map(({ time, label }) => `${time} ${label}`).join("\n");
+  return [width, height, ratio, scale.low, scale.high, palette, showSamples, showTruth, marks, span, isPaused ? right : null];
 }

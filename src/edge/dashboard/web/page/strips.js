@@ -29,15 +29,38 @@ export class Strips {
     return [...new Set([...this.chosen, ...OF_LOOPS])];
   }
 
-  /** Paints every strip. */
+  /** Brings every strip up to date; returns whether there was anything to paint. */
   draw(history, viewport, markers) {
-    const shown = between(markers, viewport.left, viewport.right);
-    let isFirst = true;
+    const changedFrom = history.takeChange();
+    let isNew = false;
+    for (const [strip, options] of this.#look(viewport, markers)) {
+      isNew = strip.draw(history, viewport, changedFrom, options) || isNew;
+    }
+    return isNew;
+  }
+
+  /** Paints every strip anew and says what was painted, by quantity. For tests. */
+  drawAnew(history, viewport, markers) {
+    const painted = [...this.#look(viewport, markers)];
+    return Object.fromEntries(painted.map(([strip, options]) => [strip.name, strip.drawAnew(history, viewport, options)]));
+  }
+
+  /** Pictures of all strips with their time from edge to edge. */
+  *stretched(history, viewport, markers) {
+    for (const [strip, options] of this.#look(viewport, markers)) yield [strip, strip.stretched(history, viewport, options)];
+  }
+
+  // Each strip and what is to be seen on it; the first one has the labels of the marks.
+  *#look(viewport, markers) {
+    const common = {
+      markers: between(markers, viewport.left, viewport.right),
+      showSamples: this.showSamples.checked,
+      showTruth: this.showTruth.checked,
+    };
+    let withLabels = true;
     for (const strip of this.strips.values()) {
-      strip.draw(history, viewport, {
-        markers: shown, withLabels: isFirst, showSamples: this.showSamples.checked, showTruth: this.showTruth.checked,
-      });
-      isFirst = false;
+      yield [strip, { ...common, withLabels }];
+      withLabels = false;
     }
   }
 
@@ -49,7 +72,7 @@ export class Strips {
 
   /** Forgets scales of another bed. */
   reset() {
-    for (const strip of this.strips.values()) strip.scale.reset();
+    for (const strip of this.strips.values()) strip.reset();
   }
 
   [Symbol.iterator]() {

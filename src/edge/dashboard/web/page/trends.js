@@ -1,6 +1,6 @@
 // Trends over minutes: estimated parameters, and what each beat amounts to. A small chart for each.
 
-import { byId, element, setAttribute, setText } from "./dom.js";
+import { byId, element, setAttribute, setHidden, setText } from "./dom.js";
 import { describeBeat, describeParameter } from "./names.js";
 import { decimals, duration, NONE, number, spread } from "./numbers.js";
 import { trendFigure } from "./trendfigure.js";
@@ -19,13 +19,12 @@ export class Trends {
     this.cards = new Map();
   }
 
-  /** Adds cards for what has a trend by now and writes their numbers. */
-  write(history, viewport) {
-    for (const name of BEAT_TRENDS) {
-      if (history.beats.has(name)) this.#card("beats", name)?.write(history, viewport);
-    }
-    for (const name of history.parameters.keys()) this.#card("parameters", name)?.write(history, viewport);
-    byId("no-parameters").hidden = history.parameters.size > 0;
+  /** Adds cards for what has a trend by now and writes their numbers; `kind` is `beats` or `parameters`. */
+  write(kind, history, viewport) {
+    const isBeats = kind === "beats";
+    const names = isBeats ? BEAT_TRENDS.filter((name) => history.beats.has(name)) : history.parameters.keys();
+    for (const name of names) this.#card(kind, name)?.write(history, viewport);
+    if (!isBeats) setHidden(byId("no-parameters"), history.parameters.size > 0);
   }
 
   /** Forgets the cards of another bed. */

@@ -2,15 +2,17 @@
 
 import { longestSpacing } from "./runs.js";
 
-/** Share of the rows `[from, to)` of `truth` whose `value` lies within the band that `estimate` gives for `name` at that
- * time, between its rows in proportion; null where no row can be compared. */
-export function shareInside(truth, value, estimate, name, from, to) {
+/** Share of the truth of `name` from time `left` to `right` that lies within the band of the estimate at that time,
+ * between its rows in proportion; null where no row can be compared. */
+export function shareInside({ truth, estimate }, name, left, right) {
+  const value = truth.column(name);
+  const [from, to] = [truth.lower(left), truth.lower(right)];
   const [low, high] = [estimate.column(`${name}.low`), estimate.column(`${name}.high`)];
-  if (!low || estimate.length < 2 || from >= to) return null;
+  if (!value || !low || estimate.length < 2 || from >= to) return null;
   const { times } = estimate;
   const last = Math.min(estimate.lower(truth.times[to - 1]) + 1, estimate.end);
   let i = Math.max(estimate.lower(truth.times[from]), estimate.first + 1);
-  const longest = longestSpacing(times, i - 1, last);
+  const longest = longestSpacing(estimate, last);
   let [inside, compared] = [0, 0];
   for (let k = from; k < to; k += 1) {
     const time = truth.times[k];

@@ -1,7 +1,9 @@
-//! What the daemon is told from the keyboard, on a thread beside the screen: the daemon may take seconds to answer.
+//! What an operator tells the daemon from a dashboard. The daemon may take seconds to answer: it happens beside the
+//! screen, or beside the page.
 
 use std::sync::mpsc::{Receiver, SyncSender};
 
+use super::bed::event_time;
 use crate::edge::bus::Bus;
 use crate::edge::operator::{Operator, OperatorError};
 use crate::estimate::time::EventTime;
@@ -14,8 +16,8 @@ pub(super) const QUEUE: usize = 8;
 pub(super) enum Errand {
     /// An alarm was seen, or without a name all of the bed.
     Acknowledge { bed: String, alarm: Option<String> },
-    /// Something about a bed.
-    Note { bed: String, time: EventTime, text: String },
+    /// Something about a bed at an event time, or now.
+    Note { bed: String, time: Option<EventTime>, text: String },
 }
 
 /// What has become of an errand, for people.
@@ -26,6 +28,12 @@ pub(super) struct Outcome {
 }
 
 impl Errand {
+    /// The bed that it is about.
+    pub(super) fn bed(&self) -> &str {
+        let (Self::Acknowledge { bed, .. } | Self::Note { bed, .. }) = self;
+        bed
+    }
+
     /// What is under way.
     pub(super) fn announcement(&self) -> String {
         match self {
@@ -35,7 +43,15 @@ impl Errand {
         }
     }
 
-    fn run(&self, bus: &dyn Bus, prefix: &str, author: &str) -> Result<String, OperatorError> {
+    /// Runs it; takes as long as the daemon takes to answer, a few seconds at most.
+    pub(super) fn run(&self, bus: &dyn Bus, prefix: &str, author: &str) -> Outcome {
+        match self.tell(bus, prefix, author) {
+            Ok(text) => Outcome { text, is_failure: false },
+            Err(error) => Outcome { text: format!("failed: {error}"), is_failure: true },
+        }
+    }
+
+    fn tell(&self, bus: &dyn Bus, prefix: &str, author: &str) -> Result<String, OperatorError> {
         match self {
             Self::Acknowledge { bed, alarm } => {
                 let seen = Operator { bus, prefix, bed }.acknowledge(alarm.as_deref(), author)?;
@@ -46,9 +62,9 @@ impl Errand {
                 })
             }
             Self::Note { bed, time, text } => {
-                let (time, heard) = Operator { bus, prefix, bed }.note(text, author, Some(*time))?;
+                let (time, heard) = Operator { bus, prefix, bed }.note(text, author, *time)?;
                 let unheard = if heard { "" } else { "; nobody listens" };
-                Ok(format!("sent: note about {bed} at {}{unheard}", super::style::event_time(time.0)))
+                Ok(format!("sent: note about {bed} at {}{unheard}", event_time(time.0)))
             }
         }
     }
@@ -63,12 +79,8 @@ pub(super) fn serve(
     outcomes: &SyncSender<Outcome>,
 ) {
     for errand in errands {
-        let outcome = match errand.run(bus, prefix, author) {
-            Ok(text) => Outcome { text, is_failure: false },
-            Err(error) => Outcome { text: format!("failed: {error}"), is_failure: true },
-        };
         // A screen that takes none is gone.
-        if outcomes.send(outcome).is_err() {
+        if outcomes.send(errand.run(bus, prefix, author)).is_err() {
             return;
         }
     }
