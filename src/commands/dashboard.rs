@@ -42,8 +42,8 @@ impl Dashboard {
         tokio_runtime()?.block_on(async {
             let listener = bind("--listen", &self.listen).await?;
             let link = Link::default();
-            let web = Web::start(listener, &config.publish.prefix, Topics::All, link.connect(settings.clone()))
-                .map_err(super::failed)?;
+            let web =
+                Web::start(listener, &config, Topics::All, link.connect(settings.clone())).map_err(super::failed)?;
             say(format!(
                 "hemostream dashboard of {} at http://{}/ ; Ctrl-C stops",
                 settings.connect.join(", "),

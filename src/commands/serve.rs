@@ -160,7 +160,7 @@ impl Serve {
 async fn observe(address: &str, config: &Config, bus: &ZenohBus) -> Result<Web, Failure> {
     let listener = bind("--metrics", address).await?;
     let bus: Arc<dyn Bus> = Arc::new(bus.clone());
-    let web = Web::start(listener, &config.publish.prefix, Topics::Health, Box::new(move || Ok(Arc::clone(&bus))));
+    let web = Web::start(listener, config, Topics::Health, Box::new(move || Ok(Arc::clone(&bus))));
     let web = web.map_err(failed)?;
     say(format!("metrics at http://{}/metrics", web.address()));
     Ok(web)

@@ -37,7 +37,7 @@ impl Watch {
         let stop = stop_when_asked(&runtime);
         let settings = client_settings(&config, &self.connect);
         let bus = runtime.block_on(async { ZenohBus::open(&settings) })?;
-        let watched = terminal::run(&bus, &config.publish.prefix, self.bed.as_deref(), &self.author, &stop);
+        let watched = terminal::run(&bus, &config, self.bed.as_deref(), &self.author, &stop);
         bus.close();
         watched.map_err(failed)
     }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use hemostream::edge::bus::{Bus, BusError, Delivery, Encoding, MemoryBus, Message};
+use hemostream::edge::config::Config;
 use hemostream::edge::dashboard::web::{Topics, Web};
 use hemostream::edge::wire::{self, BeatEstimate, Header, SCHEMA, STATE_STATISTICS, StateEstimate, Status};
 use serde_json::Value;
@@ -86,7 +87,8 @@ async fn start(bus: &MemoryBus, topics: Topics) -> Web {
     let bus = bus.clone();
     let connect = Box::new(move || -> Result<Arc<dyn Bus>, BusError> { Ok(Arc::new(bus.clone())) });
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
-    let web = Web::start(listener, "ward", topics, connect).unwrap();
+    let config = Config::load_from(None, [], &["publish.prefix=ward".to_owned()]).unwrap().0;
+    let web = Web::start(listener, &config, topics, connect).unwrap();
     for _ in 0..500 {
         if ask(&web, "/readyz", "").await.0 == 200 {
             break;

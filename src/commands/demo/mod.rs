@@ -95,7 +95,7 @@ impl Demo {
             let running = Running::start(Arc::new(daemon.clone()), &config)?;
             let link = Link::default();
             let connect = link.connect(client.clone());
-            let web = Web::start(listener, &config.publish.prefix, Topics::All, connect).map_err(failed)?;
+            let web = Web::start(listener, &config, Topics::All, connect).map_err(failed)?;
             say(format!("open  http://{}/  to watch; Ctrl-C stops\n", web.address()));
             let viewer = ZenohBus::open(&client)?;
             let shown = tokio::task::block_in_place(|| self.show(&config, &sets, &viewer, &stop));
@@ -139,8 +139,7 @@ impl Demo {
             let (scored, scoring_ended) = (&boards, &ended);
             scope.spawn(move || score(&messages, scored, scoring_ended));
             let shown = if self.terminal {
-                let prefix = &config.publish.prefix;
-                terminal::run(bus, prefix, Some(patients::CRISIS_BED), "", &ended).map_err(failed)
+                terminal::run(bus, config, Some(patients::CRISIS_BED), "", &ended).map_err(failed)
             } else {
                 lines(&boards, &ended);
                 Ok(())

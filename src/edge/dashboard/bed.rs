@@ -36,10 +36,6 @@ const MAX_STATUS_ENTRIES: usize = 32;
 const MAX_ALARMS: usize = 64;
 const MAX_TEXT: usize = 200;
 
-/// Monitor labels of the six pressures, apart from their own names.
-const LABELS: [&[&str]; Pressures::LEN] =
-    [&["lvp"], &["abp", "art", "aobp", "uap"], &["cvp"], &["rvp"], &["pap"], &["lap"]];
-
 /// A mean and the 5 and 95 % quantiles; `f32` because a screen has few dots.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Band {
@@ -189,12 +185,6 @@ pub(super) fn quantity_names() -> impl Iterator<Item = &'static str> {
 /// Where a quantity stands in that order.
 pub(super) fn quantity(name: &str) -> Option<usize> {
     quantity_names().position(|n| n == name)
-}
-
-/// The pressure that a channel label stands for.
-pub(super) fn channel(label: &str) -> Option<usize> {
-    let by_label = || LABELS.iter().position(|labels| labels.iter().any(|l| l.eq_ignore_ascii_case(label)));
-    Pressures::NAMES.iter().position(|n| *n == label).or_else(by_label)
 }
 
 /// The statistic `name` in one row of a table of `names`.
@@ -467,7 +457,8 @@ impl Bed {
     /// Where a quantity comes from; flows and volumes have no sensors.
     pub(super) fn origin(&self, quantity: usize) -> Origin {
         let Some(samples) = self.samples.get(quantity) else { return Origin::Inferred };
-        let listed = self.status.as_ref().and_then(|s| s.channels.iter().find(|c| channel(&c.name) == Some(quantity)));
+        let listed =
+            self.status.as_ref().and_then(|s| s.channels.iter().find(|c| self::quantity(&c.name) == Some(quantity)));
         match listed.map(|c| c.state.as_str()) {
             Some("live") => Origin::Observed,
             Some(_) => Origin::Silent,

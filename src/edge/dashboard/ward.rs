@@ -6,13 +6,15 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use super::bed::{Bed, channel, tame};
+use super::bed::{Bed, tame};
 use super::history::Limits;
 use crate::edge::bus::{Encoding, Message};
+use crate::edge::config::Config;
 use crate::edge::wire::{
     self, Alarms, BEAT_STATISTICS, BeatEstimate, Event, Note, PARAMETER_STATISTICS, ParameterEstimate, PressureBlock,
     STATE_STATISTICS, StateEstimate, Status, Truth,
 };
+use crate::model::cvsim6::Pressures;
 
 /// Beds that are shown; further ones are counted.
 pub(super) const MAX_BEDS: usize = 1000;
@@ -38,6 +40,8 @@ pub(super) struct Memory {
 pub(super) struct Ward {
     prefix: String,
     memory: Memory,
+    /// The pressure that each label of a channel stands for.
+    labels: BTreeMap<String, usize>,
     pub(super) beds: BTreeMap<String, Bed>,
     /// Messages of the kinds shown here.
     pub(super) messages: u64,
@@ -62,10 +66,10 @@ pub(super) enum Content {
 
 impl Content {
     /// `None` for topics that are not shown.
-    fn read(topic: &str, message: &Message) -> Option<Result<Self, ()>> {
+    fn read(topic: &str, message: &Message, labels: &BTreeMap<String, usize>) -> Option<Result<Self, ()>> {
         let Message { payload, encoding, .. } = message;
         if let Some(label) = topic.strip_prefix("pressure/") {
-            let channel = channel(label)?;
+            let channel = *labels.get(label)?;
             return Some(wire::decode(payload, *encoding).map(|b| Self::Samples(channel, b)).map_err(drop));
         }
         if topic == "note" {
@@ -110,7 +114,20 @@ impl Ward {
     /// An empty ward; `prefix` is the common start of the keys.
     pub(super) fn new(prefix: &str, memory: Memory) -> Self {
         let prefix = prefix.trim_end_matches('/').to_owned();
-        Self { prefix, memory, beds: BTreeMap::new(), messages: 0, unreadable: 0, refused: 0 }
+        let labels = Pressures::NAMES.iter().enumerate().map(|(q, name)| ((*name).to_owned(), q)).collect();
+        Self { prefix, memory, labels, beds: BTreeMap::new(), messages: 0, unreadable: 0, refused: 0 }
+    }
+
+    /// The ward of a daemon with this configuration: its topics, its labels.
+    pub(super) fn of(config: &Config, memory: Memory) -> Self {
+        let mut ward = Self::new(&config.publish.prefix, memory);
+        let known = config.labels.keys().filter_map(|label| {
+            let state = config.state_of_label(label)?;
+            Some((label.clone(), *ward.labels.get(state)?))
+        });
+        let known: Vec<_> = known.collect();
+        ward.labels.extend(known);
+        ward
     }
 
     /// Takes in a message that arrived just now.
@@ -126,7 +143,7 @@ impl Ward {
     fn take(&mut self, message: &Message, arrival: Option<Duration>) {
         let below_prefix = message.key.strip_prefix(&self.prefix).and_then(|rest| rest.strip_prefix('/'));
         let Some((name, topic)) = below_prefix.and_then(|rest| rest.split_once('/')) else { return };
-        let Some(content) = Content::read(topic, message) else { return };
+        let Some(content) = Content::read(topic, message, &self.labels) else { return };
         self.messages += 1;
         // Read before the bed is made: noise under a new name is no bed.
         let Ok(content) = content else {
@@ -155,5 +172,36 @@ impl Memory {
         let longest = usize::try_from(self.history_s * NS_PER_S / SPACING_NS).unwrap_or(usize::MAX);
         let rows = longest.min(self.rows / beds.max(1));
         Limits { age_ns: self.history_s * NS_PER_S, spacing_ns: SPACING_NS, rows }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::edge::wire::SCHEMA;
+
+    #[test]
+    fn samples_are_those_of_the_pressure_that_their_label_stands_for() {
+        let sets = ["publish.prefix=icu".to_owned(), "labels.A1=p_pa".to_owned()];
+        let config = Config::load_from(None, [], &sets).unwrap().0;
+        let mut ward = Ward::of(&config, Memory { history_s: 10, rows: 100 });
+        let block = PressureBlock {
+            schema: SCHEMA,
+            sequence: 0,
+            start_ns: 0,
+            period_ns: 8_000_000,
+            offsets_ns: Vec::new(),
+            values: vec![20.0],
+            flags: 0,
+        };
+        let payload = wire::encode(&block).unwrap();
+        for label in ["A1", "ABP", "ICP"] {
+            let key = format!("icu/bed1/pressure/{label}");
+            let message = Message { key, encoding: Encoding::Bincode, payload: payload.clone() };
+            ward.apply(&message, Duration::ZERO);
+        }
+        let heard: Vec<bool> = ward.beds["bed1"].samples.iter().map(|s| s.newest_ns().is_some()).collect();
+        let expected: Vec<bool> = Pressures::NAMES.iter().map(|name| ["p_a", "p_pa"].contains(name)).collect();
+        assert_eq!(heard, expected);
     }
 }

@@ -43,6 +43,7 @@ use super::errand::{self, Errand, Outcome};
 use super::feed::{self, QUEUE, Topics};
 use super::ward::{Memory, Ward};
 use crate::edge::bus::{Bus, Message};
+use crate::edge::config::Config;
 use crate::runtime::clock::Clock;
 
 /// Longest past of the waveforms \[s\].
@@ -54,11 +55,12 @@ const FRAME: Duration = Duration::from_millis(55);
 /// Longest work on messages between two pictures, so that keys are obeyed under any load.
 const SHARE: Duration = Duration::from_millis(30);
 
-/// Shows the beds under `prefix`, `bed` first, until a key or `stop` ends it; `author` signs notes and acknowledgements.
+/// Shows the beds of a daemon with this configuration, `bed` first, until a key or `stop` ends it; `author` signs notes and acknowledgements.
 ///
 /// # Errors
 /// When the bus refuses the subscription or the terminal does not work.
-pub fn run(bus: &dyn Bus, prefix: &str, bed: Option<&str>, author: &str, stop: &AtomicBool) -> io::Result<()> {
+pub fn run(bus: &dyn Bus, config: &Config, bed: Option<&str>, author: &str, stop: &AtomicBool) -> io::Result<()> {
+    let prefix = config.publish.prefix.as_str();
     let dropped = Arc::new(AtomicU64::new(0));
     let (sender, receiver) = sync_channel(QUEUE);
     let _subscriptions = feed::subscribe(bus, prefix, Topics::All, &sender, &dropped).map_err(io::Error::other)?;
@@ -77,7 +79,7 @@ pub fn run(bus: &dyn Bus, prefix: &str, bed: Option<&str>, author: &str, stop: &
         // Restores the terminal whichever way this ends.
         let _restore = Restore;
         let mut terminal = ratatui::try_init()?;
-        let (ward, ui) = (Ward::new(prefix, MEMORY), Ui::new(bed));
+        let (ward, ui) = (Ward::of(config, MEMORY), Ui::new(bed));
         Screen { ward, ui, feed, errands, outcomes, clock: Clock::start() }.run(&mut terminal, stop)
     })
 }

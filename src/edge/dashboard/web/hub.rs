@@ -8,6 +8,7 @@ use std::time::Duration;
 use super::super::feed::{self, QUEUE, Topics};
 use super::super::ward::{Memory, Ward};
 use crate::edge::bus::{Bus, BusError, Message};
+use crate::edge::config::Config;
 use crate::runtime::clock::Clock;
 
 /// Two minutes of 50 beds at 50 rows a second: about 150 MB with samples and truth.
@@ -33,9 +34,9 @@ pub(super) struct Hub {
 }
 
 impl Hub {
-    pub(super) fn new(prefix: &str) -> Self {
+    pub(super) fn new(config: &Config) -> Self {
         Self {
-            ward: Mutex::new(Ward::new(prefix, MEMORY)),
+            ward: Mutex::new(Ward::of(config, MEMORY)),
             clock: Clock::start(),
             bus: OnceLock::new(),
             dropped: Arc::default(),

@@ -39,6 +39,7 @@ pub use self::hub::Connect;
 use self::hub::Hub;
 use self::metrics::Own;
 pub use super::feed::Topics;
+use crate::edge::config::Config;
 
 /// Pages open at the same time.
 const MAX_PAGES: usize = 64;
@@ -57,12 +58,12 @@ pub struct Web {
 }
 
 impl Web {
-    /// Starts serving; `topics` says whether with the page, or metrics and health alone. Needs a tokio runtime.
+    /// Starts serving the beds of a daemon with this configuration; `topics` says whether with the page, or metrics and health alone. Needs a tokio runtime.
     ///
     /// # Errors
     /// When the listener or the system does not work.
-    pub fn start(listener: TcpListener, prefix: &str, topics: Topics, connect: Connect) -> io::Result<Self> {
-        let hub = Arc::new(Hub::new(prefix));
+    pub fn start(listener: TcpListener, config: &Config, topics: Topics, connect: Connect) -> io::Result<Self> {
+        let hub = Arc::new(Hub::new(config));
         let address = listener.local_addr()?;
         let router = match topics {
             // A dashboard is of use while it has a link to the daemon; the daemon itself needs nobody.
