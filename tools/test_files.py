@@ -145,12 +145,16 @@ def free_port() -> int:
         return int(taken.getsockname()[1])
 
 
-class Recordings(WithProgram):
+class RecordingCase(WithProgram):
+    """With a daemon to be recorded."""
+
+    daemon_settings: tuple[str, ...] = ()
+
     def setUp(self) -> None:
         super().setUp()
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.recording = self.folder / "recording"
-        self.daemon = self.start("serve", *settings(f"zenoh.listen=['{self.endpoint}']"))
+        self.daemon = self.start("serve", *settings(f"zenoh.listen=['{self.endpoint}']", *self.daemon_settings))
         self.wait_for_daemon()
 
     def wait_for_daemon(self) -> None:
@@ -164,9 +168,9 @@ class Recordings(WithProgram):
                 time.sleep(0.05)
         self.fail("the daemon does not listen")
 
-    def record(self, *more: str) -> subprocess.Popen[str]:
+    def record(self, flush_s: float = 0.3) -> subprocess.Popen[str]:
         recorder = self.start(
-            "record", "--output", "recording", "--connect", self.endpoint, "--flush-s", "0.3", *more, *settings()
+            "record", "--output", "recording", "--connect", self.endpoint, "--flush-s", str(flush_s), *settings()
         )
         until = time.monotonic() + PATIENCE_S
         while not (self.recording / ".lock").exists():
@@ -193,6 +197,8 @@ class Recordings(WithProgram):
             with contextlib.suppress(FileNotFoundError):
                 found = self.rows(table)
 
+
+class Recordings(RecordingCase):
     def test_pandas_and_duckdb_read_what_is_recorded_and_plotted(self) -> None:
         recorder = self.record()
         self.replay("--seconds", "3", "--speed", "2", "--beds", "2", "--bed", "icu")
@@ -270,6 +276,38 @@ class Recordings(WithProgram):
         blocks = pd.read_parquet(self.recording / "samples")["arrival"].nunique()
         truths = pd.read_parquet(self.recording / "truth")["arrival"].nunique()
         self.assertIn(f"published {blocks + truths} messages of ", said)
+
+
+class LongRecording(RecordingCase):
+    RATE_HZ = 5
+    daemon_settings = (f"publish.rate_hz={RATE_HZ}", "window.length_s=0.02")
+
+    def test_ten_beds_for_ten_minutes_are_read_by_pandas_and_duckdb(self) -> None:
+        beds, minutes, rate_hz = 10, 10, 50
+        recorder = self.record(flush_s=2.0)
+        publisher = self.start(
+            *("replay", "--connect", self.endpoint, "--beds", str(beds), "--bed", "icu", "--speed", "15"),
+            *("--seconds", str(60 * minutes), "--rate-hz", str(rate_hz), "--block-s", "0.2", *settings()),
+        )
+        publisher.wait(3 * PATIENCE_S)
+        self.wait_for("estimates", beds * (60 * minutes - 1) * self.RATE_HZ)
+        said = self.stop(recorder)
+        self.assertIn("messages dropped: 0", said)
+
+        samples = pd.read_parquet(self.recording / "samples")
+        for (bed, channel), rows in samples.groupby(["bed", "channel"], observed=True):
+            times = np.sort(rows["time_ns"].to_numpy())
+            self.assertEqual(len(times), 60 * minutes * rate_hz, f"{bed} {channel}")
+            self.assertEqual(set(np.diff(times)), {1_000_000_000 // rate_hz}, f"{bed} {channel}")
+        pattern = self.recording / "estimates" / "**" / "*.parquet"
+        query = "select bed, count(distinct time_ns), (max(time_ns) - min(time_ns)) / 1e9, avg(p_a_q95 - p_a_q05) from "
+        query += f"read_parquet('{pattern}', hive_partitioning = true) group by bed"
+        found = duckdb.sql(query).fetchall()
+        self.assertEqual(len(found), beds)
+        for bed, count, span_s, width in found:
+            self.assertGreaterEqual(count, (60 * minutes - 1) * self.RATE_HZ, bed)
+            self.assertGreater(span_s, 60 * minutes - 1.5, bed)
+            self.assertGreater(width, 0.0, bed)
 
 
 if __name__ == "__main__":

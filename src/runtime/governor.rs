@@ -8,6 +8,8 @@
 //! - Nobody has waited for long, and the step above would leave a reserve: after two such looks, one step up; to the top at
 //!   once where even that would leave half of the time free.
 //!
+//! Too few members know too little of what they share: how few there may be is for the bed to say.
+//!
 //! Deliberately absent: clocks, beds, threads.
 
 use std::time::Duration;

@@ -23,8 +23,8 @@ BED = "icu-3"
 LIGHT = ("--set", "window.length_s=0.004")
 CRISIS_S = 32.0
 """After the start: the embolism is 17 s old and its alarms are on; the treatment follows at 75 s."""
-SETTLE_S = 1.0
-"""Charts follow a new size about a second later."""
+SETTLE_S = 2.5
+"""Charts follow a new size about two seconds later."""
 CHARTS_ARE_DRAWN = """() => [...document.querySelectorAll(".trend-plot, .loop")].every((node) => {
   const { top, bottom, width } = node.getBoundingClientRect();
   return width === 0 || bottom < 0 || top > innerHeight || node.querySelector(".main-svg");
