@@ -42,7 +42,10 @@ impl Acknowledge {
             say(format!("acknowledged: {} ({})", alarm.name, alarm.text));
         }
         if acknowledged.is_empty() {
-            say("nothing to acknowledge: no alarm is raised that nobody has seen");
+            say(match &self.alarm {
+                Some(name) => format!("nothing to acknowledge: \"{name}\" is not raised, or was seen before"),
+                None => "nothing to acknowledge: no alarm is raised that nobody has seen".to_owned(),
+            });
         }
         Ok(())
     }

@@ -11,10 +11,10 @@ use tokio::net::TcpListener;
 
 use super::replay::client_settings;
 use super::serve::{asked_to_stop, tokio_runtime};
-use super::{ConfigArgs, Failure, log_to_stderr, say};
+use super::{ConfigArgs, Failure, LOG, log_to_stderr, say};
 
 /// Where the page is, unless told otherwise.
-pub(crate) const ADDRESS: &str = "127.0.0.1:8787";
+const ADDRESS: &str = "127.0.0.1:8787";
 
 /// Show beds in a browser: ward, waveforms, loops, trends, alarms; and metrics for Prometheus
 #[derive(Args)]
@@ -26,9 +26,10 @@ pub(crate) const ADDRESS: &str = "127.0.0.1:8787";
 pub(crate) struct Dashboard {
     #[command(flatten)]
     config: ConfigArgs,
-    /// Address and port of the page; port 0 is any that is free. Whoever reaches it sees patients
-    #[arg(long, value_name = "ADDRESS", default_value = ADDRESS)]
-    listen: String,
+    /// Address and port of the page; any free port if this one is taken [default: 127.0.0.1:8787]. Whoever reaches it sees
+    /// patients
+    #[arg(long, value_name = "ADDRESS")]
+    listen: Option<String>,
     /// Where the daemon listens; over `zenoh.connect` of the configuration
     #[arg(long, value_name = "ENDPOINT")]
     connect: Vec<String>,
@@ -37,10 +38,10 @@ pub(crate) struct Dashboard {
 impl Dashboard {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
-        log_to_stderr("hemostream=info,warn")?;
+        log_to_stderr(LOG)?;
         let settings = client_settings(&config, &self.connect);
         tokio_runtime()?.block_on(async {
-            let listener = bind("--listen", &self.listen).await?;
+            let listener = page_listener(self.listen.as_deref()).await?;
             let link = Link::default();
             let web =
                 Web::start(listener, &config, Topics::All, link.connect(settings.clone())).map_err(super::failed)?;
@@ -57,10 +58,21 @@ impl Dashboard {
     }
 }
 
+/// A listener for the page: where the user says, or else at [`ADDRESS`], or else at any port.
+pub(crate) async fn page_listener(address: Option<&str>) -> Result<TcpListener, Failure> {
+    let Some(address) = address else {
+        return match bind("--listen", ADDRESS).await {
+            Ok(listener) => Ok(listener),
+            Err(_) => bind("--listen", "127.0.0.1:0").await,
+        };
+    };
+    bind("--listen", address).await
+}
+
 /// A listener at an address that a user gave.
 pub(crate) async fn bind(option: &str, address: &str) -> Result<TcpListener, Failure> {
     TcpListener::bind(address).await.map_err(|error| {
-        let hint = "expected ADDRESS:PORT with a port that is free, for example 127.0.0.1:8787";
+        let hint = "expected ADDRESS:PORT with a port that is free; 127.0.0.1:0 finds one";
         Failure::Input(format!("{option} {address}: {error}; {hint}"))
     })
 }

@@ -135,6 +135,9 @@ pub(crate) fn progress_bar(length: u64, template: &str) -> ProgressBar {
     bar
 }
 
+/// What services log unless `HEMOSTREAM_LOG` says otherwise. That peers do not gossip is what the settings ask for.
+const LOG: &str = "hemostream=info,warn,zenoh::net::routing::hat::peer=error";
+
 /// Starts the log: what is written says `HEMOSTREAM_LOG`, how says `HEMOSTREAM_LOG_FORMAT` (text or json).
 fn log_to_stderr(default: &str) -> Result<(), Failure> {
     let filter = tracing_subscriber::EnvFilter::try_from_env("HEMOSTREAM_LOG")

@@ -10,7 +10,7 @@ use hemostream::edge::zenoh::ZenohBus;
 use super::replay::client_settings;
 use super::serve::{stop_when_asked, tokio_runtime};
 use super::simulate::positive;
-use super::{ConfigArgs, Failure, log_to_stderr, progress_bar, say};
+use super::{ConfigArgs, Failure, LOG, log_to_stderr, progress_bar, say};
 
 /// Record samples, estimates, events and health of all beds in Parquet files
 ///
@@ -42,7 +42,7 @@ pub(crate) struct Record {
 impl Record {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
-        log_to_stderr("hemostream=info,warn")?;
+        log_to_stderr(LOG)?;
         let options = RecordOptions {
             prefix: config.publish.prefix.clone(),
             beds: self.bed.clone(),

@@ -12,7 +12,7 @@ use hemostream::edge::zenoh::ZenohBus;
 
 use super::serve::{stop_when_asked, tokio_runtime};
 use super::simulate::{not_negative, positive};
-use super::{ConfigArgs, Failure, log_to_stderr, progress_bar, say};
+use super::{ConfigArgs, Failure, LOG, log_to_stderr, progress_bar, say};
 
 /// Publish a patient, synthetic or recorded, or a whole recording, at its own pace
 #[derive(Args)]
@@ -83,7 +83,7 @@ struct Connected {
 impl Replay {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
-        log_to_stderr("hemostream=info,warn")?;
+        log_to_stderr(LOG)?;
         match &self.recording {
             Some(directory) => self.play(&config, Playback::open(directory, &self.bed, &config.publish.prefix)?),
             None => self.publish(&config),

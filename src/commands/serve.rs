@@ -16,7 +16,7 @@ use hemostream::runtime::service::{Inlet, Limits, Service};
 use hemostream::runtime::workers::Workers;
 
 use super::dashboard::bind;
-use super::{ConfigArgs, Failure, failed, log_to_stderr, say};
+use super::{ConfigArgs, Failure, LOG, failed, log_to_stderr, say};
 
 /// Run the daemon: estimate every bed whose pressures arrive
 #[derive(Args)]
@@ -131,7 +131,7 @@ pub(crate) fn stop_when_asked(runtime: &tokio::runtime::Runtime) -> Arc<AtomicBo
 impl Serve {
     pub(crate) fn run(&self) -> Result<(), Failure> {
         let (config, _) = self.config.load()?;
-        log_to_stderr("hemostream=info,warn")?;
+        log_to_stderr(LOG)?;
         tokio_runtime()?.block_on(async {
             let bus = ZenohBus::open(&config.zenoh)?;
             let running = Running::start(Arc::new(bus.clone()), &config)?;

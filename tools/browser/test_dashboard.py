@@ -235,6 +235,23 @@ class Watching(DemoCase):
         other = self.open(f"#bed/{CALM_BED}")
         until(lambda: other.get_by_test_id("event-log").get_by_text(note).count(), 10.0, "the note on another page")
 
+    def test_a_pause_is_said_and_the_menu_closes_by_itself(self) -> None:
+        page = self.open(f"#bed/{CALM_BED}")
+        drawn(page)
+        menu = page.locator("#strip-menu")
+        for leave in (lambda: page.keyboard.press("Escape"), lambda: page.locator("#bed-name").click()):
+            menu.locator("summary").click()
+            self.assertTrue(menu.evaluate("node => node.open"))
+            leave()
+            self.assertFalse(menu.evaluate("node => node.open"))
+        self.assertEqual(account(page)["view"], "bed")
+        page.keyboard.press(" ")
+        said = page.locator("#bed-paused")
+        until(said.is_visible, 5.0, "a word about the pause")
+        self.assertIn("PAUSED", said.text_content() or "")
+        page.keyboard.press("l")
+        until(lambda: not said.is_visible(), 5.0, "live again")
+
     def test_a_note_that_is_not_taken_stays_and_says_why(self) -> None:
         page = self.open("#bed/nobody")
         until(lambda: page.locator("#bed-unknown").is_visible(), 10.0, "a bed that nobody knows")
@@ -288,7 +305,7 @@ class Crisis(DemoCase):
         self.assertGreater(self.demo.age_s, CRISIS_S, "before there was a reason")
         for calm in ("icu-1", "icu-2"):
             self.assertNotEqual(tile(page, calm).get_attribute("data-alarm"), "high")
-        self.assertEqual(page.locator("#count-high b").text_content(), "1")
+        self.assertGreaterEqual(int(page.locator("#count-high b").text_content() or 0), 1)
 
         alarmed.click()
         name = "high pulmonary pressure"

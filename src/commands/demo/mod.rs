@@ -19,7 +19,7 @@ use hemostream::edge::replay::{ReplayOptions, run, wait_for_listener};
 use hemostream::edge::scoreboard::Scoreboard;
 use hemostream::edge::zenoh::ZenohBus;
 
-use super::dashboard::{ADDRESS, Link, bind};
+use super::dashboard::{Link, page_listener};
 use super::serve::{Running, stop_when_asked, tokio_runtime};
 use super::simulate::positive;
 use super::{Failure, failed, say};
@@ -90,7 +90,7 @@ impl Demo {
         let runtime = tokio_runtime()?;
         let stop = stop_when_asked(&runtime);
         runtime.block_on(async {
-            let listener = self.listener().await?;
+            let listener = page_listener(self.listen.as_deref()).await?;
             let daemon = ZenohBus::open(&config.zenoh)?;
             let running = Running::start(Arc::new(daemon.clone()), &config)?;
             let link = Link::default();
@@ -109,16 +109,6 @@ impl Demo {
     }
 
     /// The address asked for; without one a port of its own if the usual one is taken.
-    async fn listener(&self) -> Result<tokio::net::TcpListener, Failure> {
-        match &self.listen {
-            Some(address) => bind("--listen", address).await,
-            None => match bind("--listen", ADDRESS).await {
-                Ok(listener) => Ok(listener),
-                Err(_) => bind("--listen", "127.0.0.1:0").await,
-            },
-        }
-    }
-
     /// Replays and shows until it ends; then the summary.
     fn show(&self, config: &Config, sets: &[String], bus: &ZenohBus, stop: &Arc<AtomicBool>) -> Result<(), Failure> {
         let boards = Shared::default();

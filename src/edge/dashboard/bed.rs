@@ -74,6 +74,8 @@ pub(super) struct TrendPoint {
     pub(super) band: Band,
     /// Whether the data said something about it then.
     pub(super) is_informed: bool,
+    /// What it was; NaN where nobody tells.
+    pub(super) truth: f32,
 }
 
 /// A clinical quantity of a heart beat.
@@ -269,7 +271,9 @@ impl Bed {
                 self.parameters.push(Parameter::new(name));
                 self.parameters.len() - 1
             });
-            self.parameters[at].update(estimate.header.time_ns, row);
+            let truth = self.true_parameters.get(self.parameters[at].name.as_str());
+            let truth = truth.map_or(f32::NAN, |truth| *truth as f32);
+            self.parameters[at].update(estimate.header.time_ns, row, truth);
         }
     }
 
@@ -522,13 +526,13 @@ impl Parameter {
         self.is_identifiable && self.since_informed_s <= UNINFORMED_AFTER_S
     }
 
-    fn update(&mut self, time_ns: i64, row: &[f64]) {
+    fn update(&mut self, time_ns: i64, row: &[f64], truth: f32) {
         let fields = ["mean", "q05", "q95", "since_informed_s", "identifiable"];
         let [mean, low, high, since_informed_s, identifiable] =
             fields.map(|name| statistic(&PARAMETER_STATISTICS, row, name));
         let is_informed = identifiable > 0.5 && since_informed_s <= UNINFORMED_AFTER_S;
         let band = Band::from_row(&PARAMETER_STATISTICS, row);
-        self.trend.push(time_ns, TrendPoint { band, is_informed }, TREND);
+        self.trend.push(time_ns, TrendPoint { band, is_informed, truth }, TREND);
         let (name, unit, trend) = (std::mem::take(&mut self.name), self.unit, std::mem::take(&mut self.trend));
         *self = Self { name, unit, mean, low, high, since_informed_s, is_identifiable: identifiable > 0.5, trend };
     }

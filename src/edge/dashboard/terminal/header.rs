@@ -41,7 +41,7 @@ pub(super) fn badge(liveness: Liveness) -> (String, Style) {
 pub(super) fn draw_ward(buf: &mut Buffer, area: Rect, ward: &Ward, now: Duration) {
     let mut spans = vec![
         Span::styled(" hemostream ", style::QUIET),
-        Span::styled(format!(" {} beds", ward.beds.len()), style::STRONG),
+        Span::styled(format!(" {}", style::beds(ward.beds.len())), style::STRONG),
     ];
     for (priority, sign, look) in
         [("high", "▲", style::HIGH_SEEN), ("medium", "◆", style::MEDIUM_SEEN), ("low", "●", style::LOW_SEEN)]

@@ -55,7 +55,7 @@ pub(super) fn draw(buf: &mut Buffer, area: Rect, ward: &Ward, ui: &Ui, now: Dura
 
 fn title(ward: &Ward, ui: &Ui, listed: usize) -> Vec<Span<'static>> {
     let mut title = vec![
-        Span::styled(format!("{} beds under {}", ward.beds.len(), ward.prefix()), style::STRONG),
+        Span::styled(format!("{} under {}", style::beds(ward.beds.len()), ward.prefix()), style::STRONG),
         Span::styled(format!("  {}", ui.order.name()), style::QUIET),
     ];
     if !ui.filter.is_empty() {

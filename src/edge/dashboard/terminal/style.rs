@@ -113,6 +113,11 @@ pub(super) fn fit(text: &str, longest: usize) -> String {
     text.chars().take(longest.saturating_sub(1)).chain((longest > 0).then_some('…')).collect()
 }
 
+/// So many beds, in words.
+pub(super) fn beds(count: usize) -> String {
+    if count == 1 { "1 bed".to_owned() } else { format!("{count} beds") }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -24,6 +24,7 @@ pub type Connect = Box<dyn Fn() -> Result<Arc<dyn Bus>, BusError> + Send>;
 
 /// The ward behind a lock, and the bus once it is reached.
 pub(super) struct Hub {
+    topics: Topics,
     ward: Mutex<Ward>,
     clock: Clock,
     bus: OnceLock<Arc<dyn Bus>>,
@@ -34,8 +35,9 @@ pub(super) struct Hub {
 }
 
 impl Hub {
-    pub(super) fn new(config: &Config) -> Self {
+    pub(super) fn new(config: &Config, topics: Topics) -> Self {
         Self {
+            topics,
             ward: Mutex::new(Ward::of(config, MEMORY)),
             clock: Clock::start(),
             bus: OnceLock::new(),
@@ -58,6 +60,11 @@ impl Hub {
     /// The bus, once it is reached.
     pub(super) fn bus(&self) -> Option<&Arc<dyn Bus>> {
         self.bus.get()
+    }
+
+    /// Whether there is a page, rather than metrics and health alone.
+    pub(super) fn has_page(&self) -> bool {
+        self.topics == Topics::All
     }
 
     /// Whether the bus is reached at all.
@@ -84,11 +91,11 @@ impl Hub {
     }
 
     /// Takes in what is on the bus until it is told to stop; a thread of its own runs it.
-    pub(super) fn feed(&self, connect: &Connect, topics: Topics) {
+    pub(super) fn feed(&self, connect: &Connect) {
         let Some(bus) = self.reach(connect) else { return };
         let prefix = self.with_ward(|ward| ward.prefix().to_owned());
         let (sender, receiver) = sync_channel(QUEUE);
-        let subscriptions = match feed::subscribe(bus.as_ref(), &prefix, topics, &sender, &self.dropped) {
+        let subscriptions = match feed::subscribe(bus.as_ref(), &prefix, self.topics, &sender, &self.dropped) {
             Ok(subscriptions) => subscriptions,
             Err(error) => {
                 tracing::error!(%error, "the dashboard cannot subscribe");

@@ -30,6 +30,13 @@ struct Scrape<'a> {
 pub(super) struct Own {
     /// Messages it was too slow for.
     pub(super) dropped: u64,
+    /// Of a dashboard; the daemon itself has neither.
+    pub(super) dashboard: Option<Dashboard>,
+}
+
+/// What only a dashboard has.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Dashboard {
     /// Pages that are open.
     pub(super) pages: usize,
     /// Whether there is a link to the daemon.
@@ -108,8 +115,10 @@ pub(super) fn text(ward: &Ward, now: Duration, own: Own) -> Result<String, Error
 #[allow(clippy::cast_precision_loss)]
 fn of_process(scrape: &mut Scrape<'_>, own: Own) {
     scrape.own("beds", "Beds heard of", scrape.ward.beds.len() as f64);
-    scrape.own("connected", "Whether there is a link to the daemon", f64::from(u8::from(own.connected)));
-    scrape.own("pages", "Browser pages that are open", own.pages as f64);
+    if let Some(Dashboard { pages, connected }) = own.dashboard {
+        scrape.own("connected", "Whether there is a link to the daemon", f64::from(u8::from(connected)));
+        scrape.own("pages", "Browser pages that are open", pages as f64);
+    }
     scrape.own_count("messages", "Messages taken in", scrape.ward.messages);
     scrape.own_count("messages_dropped", "Messages that came faster than they were taken in", own.dropped);
     scrape.own_count("messages_unreadable", "Messages that were not understood", scrape.ward.unreadable);

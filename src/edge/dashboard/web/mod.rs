@@ -37,7 +37,7 @@ use tokio::task::JoinHandle;
 use self::assets::{DOCUMENT, JAVASCRIPT, MODULES, plotly_js};
 pub use self::hub::Connect;
 use self::hub::Hub;
-use self::metrics::Own;
+use self::metrics::{Dashboard, Own};
 pub use super::feed::Topics;
 use crate::edge::config::Config;
 
@@ -63,16 +63,16 @@ impl Web {
     /// # Errors
     /// When the listener or the system does not work.
     pub fn start(listener: TcpListener, config: &Config, topics: Topics, connect: Connect) -> io::Result<Self> {
-        let hub = Arc::new(Hub::new(config));
+        let hub = Arc::new(Hub::new(config, topics));
         let address = listener.local_addr()?;
-        let router = match topics {
-            // A dashboard is of use while it has a link to the daemon; the daemon itself needs nobody.
-            Topics::All => page_routes().merge(health_routes(Hub::is_connected)),
-            Topics::Health => health_routes(Hub::has_bus),
+        // A dashboard is of use while it has a link to the daemon; the daemon itself needs nobody.
+        let router = if hub.has_page() {
+            page_routes().merge(health_routes(Hub::is_connected))
+        } else {
+            health_routes(Hub::has_bus)
         };
         let feeding = Arc::clone(&hub);
-        let feed =
-            std::thread::Builder::new().name("dashboard".to_owned()).spawn(move || feeding.feed(&connect, topics))?;
+        let feed = std::thread::Builder::new().name("dashboard".to_owned()).spawn(move || feeding.feed(&connect))?;
         let router = router.with_state(Arc::clone(&hub));
         let server = tokio::spawn(async move {
             if let Err(error) = axum::serve(listener, router).await {
@@ -138,7 +138,9 @@ async fn beds(State(hub): State<Arc<Hub>>) -> Response {
 }
 
 async fn metrics(State(hub): State<Arc<Hub>>) -> Response {
-    let own = Own { dropped: hub.dropped(), pages: hub.pages.load(Ordering::Relaxed), connected: hub.is_connected() };
+    let pages = hub.pages.load(Ordering::Relaxed);
+    let dashboard = hub.has_page().then(|| Dashboard { pages, connected: hub.is_connected() });
+    let own = Own { dropped: hub.dropped(), dashboard };
     let now = hub.now();
     match hub.with_ward(|ward| metrics::text(ward, now, own)) {
         Ok(text) => ([(header::CONTENT_TYPE, metrics::CONTENT_TYPE)], text).into_response(),

@@ -154,11 +154,12 @@ impl BedPicture {
             let Some((t0, _)) = rows.first() else { continue };
             let head = json!({
                 "part": "parameters", "t0_ns": time(*t0), "n": rows.len(), "name": parameter.name,
-                "unit": parameter.unit, "truth": bed.true_parameters.get(parameter.name.as_str()),
+                "unit": parameter.unit,
             });
             let informed = rows.iter().map(|(_, p)| f32::from(u8::from(p.is_informed)));
             let bands = band_columns(rows.iter().map(|(_, p)| p.band));
-            parts.add(head, times(&rows).into_iter().chain(bands).chain(informed));
+            let truth = rows.iter().map(|(_, p)| p.truth);
+            parts.add(head, times(&rows).into_iter().chain(bands).chain(informed).chain(truth));
         }
         for (name, trend) in &bed.beat_trends {
             let rows = self.unsent("beats", name, trend);

@@ -27,8 +27,10 @@ export class AlarmList {
     setText(byId("alarm-answer"), this.onAcknowledge(name) ? "" : "Not sent: the connection is lost.");
   }
 
-  /** Shows the alarms; a list that did not change is left alone, so that no button moves away under the pointer. */
-  write(alarms) {
+  /** Shows the alarms, and beside those that are raised what is now, from `bandNow(quantity)`; a list that did not change is left alone, so that no button moves away under the pointer. */
+  write(alarms, bandNow) {
+    this.bandNow = bandNow;
+    this.#writeNow();
     const raised = byUrgency(alarms);
     const others = alarms.filter((alarm) => !isRaised(alarm));
     const key = JSON.stringify(alarms);
@@ -39,7 +41,16 @@ export class AlarmList {
     if (focused !== null) [...this.list.querySelectorAll("button")].find((b) => b.dataset.alarm === focused)?.focus();
     setHidden(this.all, !raised.some((alarm) => !alarm.acknowledged));
     setHidden(byId("no-alarms"), alarms.length > 0);
+    this.#writeNow();
     this.#announce(raised);
+  }
+
+  #writeNow() {
+    for (const node of this.list.querySelectorAll(".alarm-now")) {
+      const band = this.bandNow(node.dataset.quantity);
+      const digits = band ? decimals(band.mean, (band.high - band.low) / 2) : 0;
+      setText(node, band ? `now ${number(band.mean, digits)}` : "");
+    }
   }
 
   #announce(raised) {
@@ -58,6 +69,7 @@ export class AlarmList {
       element("span", { class: "alarm-what" }, what, " ", element("span", { class: "alarm-state", text: state })),
       element("span", { class: "alarm-text", text: detail(alarm), title: alarm.quantity }),
     );
+    if (isRaised(alarm)) item.append(element("span", { class: "alarm-now", "data-quantity": alarm.quantity }));
     if (isRaised(alarm) && !alarm.acknowledged) item.append(this.#button(alarm.name));
     return item;
   }
@@ -73,8 +85,9 @@ export class AlarmList {
 function detail(alarm) {
   const digits = decimals(alarm.mean, (alarm.high - alarm.low) / 2);
   const limit = `${labelOf(alarm.quantity)} ${alarm.side === "below" ? "<" : ">"} ${alarm.limit} ${alarm.unit}`;
-  // The band is of the moment when the alarm became what it is; what it is by now stands elsewhere.
+  // The band is of the moment when the alarm became what it is; what it is by now stands beside.
   const band = alarm.mean == null ? "" : `: ${number(alarm.mean, digits)} (${range(alarm.low, alarm.high, digits)})`;
-  const when = isRaised(alarm) ? ` at ${clockText(secondsOf(alarm.since_ns))}` : "";
-  return `${limit}${band}${when}`;
+  const since = alarm.state === "latched" ? "off since" : "since";
+  const when = isRaised(alarm) ? `, ${since} ${clockText(secondsOf(alarm.since_ns))}` : "";
+  return `${limit}${when}${band}`;
 }

@@ -4,7 +4,7 @@
 import { AlarmList } from "./alarmlist.js";
 import { badge, byUrgency } from "./alarms.js";
 import { Charts } from "./charts.js";
-import { byId, setAttribute, setHidden, setText } from "./dom.js";
+import { byId, element, setAttribute, setHidden, setText } from "./dom.js";
 import { EventLog } from "./eventlog.js";
 import { fileName, save, stripsCsv, stripsPng } from "./export.js";
 import { writeHealth } from "./health.js";
@@ -12,6 +12,7 @@ import { History } from "./history.js";
 import { isCurrent, livenessText, outageText, qualityText } from "./liveness.js";
 import { addLoops } from "./loops.js";
 import { markersOf } from "./markers.js";
+import { duration } from "./numbers.js";
 import { Numerics } from "./numerics.js";
 import { isInSight, watch } from "./sight.js";
 import { Sources } from "./sources.js";
@@ -165,7 +166,7 @@ export class Bed {
     this.numerics.write((key) => (current ? (history.beatAt(key, viewport.right) ?? liveOnly(viewport, latest.beat?.[key])) : null));
     this.strips.write(history, viewport, current);
     this.events.write(history.events);
-    this.alarms.write(latest.alarms ?? []);
+    this.alarms.write(latest.alarms ?? [], (name) => bandNow(latest, name));
     const isForAll = this.writes % WRITES_PER_UNSEEN === 0;
     this.writes += 1;
     for (const panel of this.#panels()) if (isForAll || isInSight(panel.node)) panel.write();
@@ -188,18 +189,27 @@ export class Bed {
     setAttribute(this.node, "data-liveness", liveness);
     setText(byId("bed-liveness"), head ? livenessText(liveness, head.age_s) : "waiting");
     setAttribute(byId("bed-liveness"), "data-liveness", liveness);
+    setHidden(byId("bed-paused"), !this.viewport.isPaused);
+    setText(byId("bed-paused"), `❚❚ PAUSED, waveforms and numbers of ${duration(this.viewport.newest - this.viewport.right)} ago`);
     setText(byId("bed-quality"), head ? qualityText(head) : "");
     setAttribute(byId("bed-quality"), "data-quality", head?.quality ?? "");
     setHidden(byId("bed-unknown"), head?.known !== false);
     const raised = byUrgency(this.history.latest.alarms);
-    const key = JSON.stringify(raised.slice(0, 2));
+    const [shown, others] = [raised.slice(0, 2), raised.length - 2];
+    const key = JSON.stringify([shown, others]);
     if (byId("bed-alarms").dataset.key !== key) {
       byId("bed-alarms").dataset.key = key;
-      byId("bed-alarms").replaceChildren(...raised.slice(0, 2).map(badge));
+      const more = others > 0 ? [element("span", { class: "quiet", text: `+${others} more` })] : [];
+      byId("bed-alarms").replaceChildren(...shown.map(badge), ...more);
     }
     const isHigh = raised[0]?.priority === "high";
     document.title = `${isHigh ? "▲ " : ""}${this.name} · hemostream`;
   }
+}
+
+// Band of a quantity, of a beat, or of a parameter at present, by its name.
+function bandNow({ beat, quantities, parameters }, name) {
+  return beat?.[name] ?? [...(quantities ?? []), ...(parameters ?? [])].find((entry) => entry.name === name) ?? null;
 }
 
 // Without a history of beats the last one is known, but not what it was in the past.

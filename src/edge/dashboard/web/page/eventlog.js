@@ -1,6 +1,6 @@
 // The event log, newest first, and the field for a note.
 
-import { byId, element, recall, remember, setText } from "./dom.js";
+import { byId, element, recall, remember, setAttribute, setText } from "./dom.js";
 import { eventLabel } from "./names.js";
 import { clockText } from "./time.js";
 
@@ -40,7 +40,8 @@ export class EventLog {
   answer({ ok, text }) {
     if (!this.button.disabled) return;
     this.button.disabled = false;
-    setText(this.said, ok ? "" : text);
+    setText(this.said, ok ? `✓ ${text}` : text);
+    setAttribute(this.said, "data-ok", String(ok));
     if (ok) this.text.value = "";
   }
 

@@ -18,7 +18,7 @@ export function decodeFrame(buffer) {
 
 const ROWS_BEFORE_QUANTITIES = { estimate: 2, truth: 1 };
 const ROWS_PER_QUANTITY = { estimate: 3, truth: 1 };
-const ROWS_OF_SINGLE = { samples: 2, parameters: 5, beats: 4 };
+const ROWS_OF_SINGLE = { samples: 2, parameters: 6, beats: 4 };
 
 function rowCount(part) {
   if (part.part in ROWS_OF_SINGLE) return ROWS_OF_SINGLE[part.part];

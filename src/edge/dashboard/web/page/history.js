@@ -128,8 +128,7 @@ export class History {
         return [named(this.samples, part.channel, ["value"], SAMPLES_LIMIT), { value: rows[1] }];
       case "parameters": {
         this.units.set(part.name, part.unit);
-        const truth = new Float32Array(part.n).fill(part.truth ?? NaN);
-        const columns = { mean: rows[1], low: rows[2], high: rows[3], informed: rows[4], truth };
+        const columns = { mean: rows[1], low: rows[2], high: rows[3], informed: rows[4], truth: rows[5] };
         return [named(this.parameters, part.name, Object.keys(columns), TREND_LIMIT), columns];
       }
       default: {

@@ -15,7 +15,7 @@ const FONT = "11px system-ui, sans-serif";
 
 /** Dashes of truth, and of the mean of a forecast: on, and off [px]. Times decide where they are, so that a picture
  * painted bit by bit has them where a whole one has. */
-const TRUTH_DASH = [4, 3];
+const TRUTH_DASH = [2, 5];
 const FORECAST_DASH = [6, 5];
 /** What is painted reaches so far to either side of its time [px]. */
 const REACH_PX = 3;

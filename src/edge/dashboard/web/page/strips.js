@@ -2,6 +2,7 @@
 
 import { byId, element, recall, remember } from "./dom.js";
 import { between } from "./markers.js";
+import { closeByItself } from "./menu.js";
 import { describe, FLOW_NAMES, PRESSURES, VOLUMES } from "./names.js";
 import { Strip } from "./strip.js";
 
@@ -21,6 +22,7 @@ export class Strips {
     this.showTruth = byId("show-truth");
     for (const box of [this.showSamples, this.showTruth]) box.addEventListener("change", onResize);
     this.#offer(onChoice);
+    closeByItself(byId("strip-menu"));
     this.#arrange();
   }
 

@@ -103,7 +103,7 @@ export class Ward {
   }
 
   #summarise(beds) {
-    const alarms = (priority) => beds.filter((bed) => byUrgency(bed.alarms)[0]?.priority === priority).length;
+    const alarms = (priority) => beds.flatMap((bed) => byUrgency(bed.alarms)).filter((a) => a.priority === priority).length;
     const stale = beds.filter((bed) => !isCurrent(bed.liveness)).length;
     const counts = [["high", alarms("high")], ["medium", alarms("medium")], ["low", alarms("low")], ["stale", stale]];
     setText(byId("count-beds"), `${beds.length} ${beds.length === 1 ? "bed" : "beds"}`);
