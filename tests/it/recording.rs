@@ -371,7 +371,7 @@ async fn recorded(directory: &Path, publish: impl FnOnce(&MemoryBus) + Send + 's
     let sink = Arc::clone(&outlet);
     let (service, inlet) = Service::new(model, settings, limits, workers, sink, Clock::start()).unwrap();
     let service = tokio::spawn(service.run());
-    let subscriptions = inlet::listen(&bus, &config, inlet.clone()).unwrap();
+    let subscriptions = inlet::listen(&bus, &config, inlet.clone(), outlet.recent()).unwrap();
     let published = bus.clone();
     tokio::task::spawn_blocking(move || publish(&published)).await.unwrap();
     inlet.stop().await;
