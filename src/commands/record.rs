@@ -16,7 +16,8 @@ use super::{ConfigArgs, Failure, LOG, log_to_stderr, progress_bar, say};
 ///
 /// DIR/TABLE/bed=NAME/hour=YYYY-MM-DDTHH/part-SEQ.parquet, which DuckDB (hive_partitioning) and pandas read as one table
 /// each: samples, estimates, smoothed, parameters, beats, events, truth, status, members. Stops on Ctrl-C or SIGTERM and
-/// goes on in the same directory when started again. `hemostream replay --recording DIR` plays it back.
+/// goes on in the same directory when started again. What the network drops is got from the daemon, which remembers it for
+/// some seconds. `hemostream replay --recording DIR` plays it back.
 #[derive(Args)]
 #[command(after_help = "Example:  hemostream record --output recording --connect tcp/127.0.0.1:7447")]
 pub(crate) struct Record {
@@ -28,7 +29,7 @@ pub(crate) struct Record {
     /// Bed to record; may be repeated, all if left out
     #[arg(long, value_name = "NAME")]
     bed: Vec<String>,
-    /// Longest time that what arrived waits in memory [s]
+    /// Longest time that rows wait in memory [s]; what arrives waits a second before it becomes one
     #[arg(long, default_value_t = 2.0, value_parser = positive)]
     flush_s: f64,
     /// Record the whole ensembles as well
@@ -88,6 +89,9 @@ fn summarise(summary: &Summary) {
         summary.bytes as f64 / 1e6,
         summary.dropped
     ));
+    if summary.recovered > 0 {
+        say(format!("messages that the network dropped and the daemon gave again: {}", summary.recovered));
+    }
     if summary.lost > 0 {
         say(format!("messages that never came, by their sequence numbers: {}", summary.lost));
     }

@@ -47,11 +47,11 @@ impl Running {
             queue_tasks: config.service.queue_blocks,
             report_every: Duration::from_secs_f64(1.0 / config.publish.status_rate_hz),
         };
-        let settings = config.estimator_settings()?;
+        let (settings, recent) = (config.estimator_settings()?, sink.recent());
         let (service, inlet) =
             Service::new(config.circulation()?, settings, limits, workers, sink, Clock::start()).map_err(failed)?;
         let task = tokio::spawn(service.run());
-        let listening = inlet::listen(bus.as_ref(), config, inlet.clone())?;
+        let listening = inlet::listen(bus.as_ref(), config, inlet.clone(), recent)?;
         Ok(Self { inlet, task, _listening: listening })
     }
 

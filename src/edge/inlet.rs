@@ -1,12 +1,13 @@
 //! From topics to tasks: samples are decoded and named here, and whatever is not understood becomes a counted
-//! refusal of the bed it was sent to.
+//! refusal of the bed it was sent to. Blocks of samples are remembered as they came, for recorders that missed them.
 
 use std::sync::Arc;
 
 use super::bus::{Bus, BusError, Handler, Message, Subscription};
 use super::config::{Config, Timing};
 use super::operator::MAX_AUTHOR;
-use super::wire::{Acknowledge, Beats, FLAG_LAST_BLOCK, PressureBlock, WireError, decode};
+use super::recent::Recent;
+use super::wire::{self, Acknowledge, Beats, FLAG_LAST_BLOCK, PressureBlock, WireError, decode};
 use crate::estimate::time::EventTime;
 use crate::estimate::window::RawSample;
 use crate::model::Model;
@@ -72,6 +73,12 @@ impl Decoder {
         Some(Event::Task { bed: bed.to_owned(), task })
     }
 
+    /// Sequence number of a message that has one.
+    fn sequence(&self, message: &Message) -> Option<u64> {
+        let (_, topic) = message.key.strip_prefix(&self.prefix)?.strip_prefix('/')?.split_once('/')?;
+        wire::sequence(topic, &message.payload, message.encoding)
+    }
+
     fn acknowledge(&self, message: &Message) -> Result<Task, &'static str> {
         let Acknowledge { alarm, author, .. } =
             decode(&message.payload, message.encoding).map_err(|error| refusal(&error))?;
@@ -135,11 +142,17 @@ fn samples(block: &PressureBlock) -> Option<Vec<RawSample>> {
     block.values.iter().enumerate().map(sample).collect()
 }
 
-/// Listens to the pressures of all beds and to those who acknowledge alarms, and to beats where these are told.
+/// Listens to the pressures of all beds and to those who acknowledge alarms, and to beats where these are told. `recent`
+/// remembers the pressures.
 ///
 /// # Errors
 /// When the bus does not take the subscription.
-pub fn listen(bus: &dyn Bus, config: &Config, inlet: Inlet) -> Result<Vec<Subscription>, BusError> {
+pub fn listen(
+    bus: &dyn Bus,
+    config: &Config,
+    inlet: Inlet,
+    recent: Arc<Recent>,
+) -> Result<Vec<Subscription>, BusError> {
     let decoder = Decoder::new(config);
     let prefix = &config.publish.prefix;
     let mut patterns = vec![format!("{prefix}/*/pressure/*"), format!("{prefix}/*/acknowledge")];
@@ -149,6 +162,9 @@ pub fn listen(bus: &dyn Bus, config: &Config, inlet: Inlet) -> Result<Vec<Subscr
     let take: Handler = Arc::new(move |message| {
         if let Some(event) = decoder.event(&message) {
             inlet.offer(event);
+        }
+        if let Some(sequence) = decoder.sequence(&message) {
+            recent.keep(&message.key, sequence, message.encoding, message.payload.into());
         }
     });
     patterns.iter().map(|pattern| bus.subscribe(pattern, Arc::clone(&take))).collect()

@@ -11,6 +11,7 @@ pub mod files;
 pub mod inlet;
 pub mod operator;
 pub mod outlet;
+pub mod recent;
 pub mod recording;
 pub mod replay;
 pub mod scoreboard;

@@ -1,4 +1,5 @@
-//! From outputs to topics: encoding, sequence numbers, last values for late joiners.
+//! From outputs to topics: encoding, sequence numbers, last values for late joiners, recent ones for recorders that missed
+//! some.
 //!
 //! Workers encode and hand over to one publishing thread through a bounded queue. Estimates that do not fit are dropped
 //! and counted; events have room of their own behind them, so that a subscriber that hangs costs estimates first. JSON twins are made only while somebody subscribes to them.
@@ -13,6 +14,7 @@ use serde::de::DeserializeOwned;
 
 use super::bus::{self, Bus, BusError, Delivery, Encoding, Message, Subscription};
 use super::config::Config;
+use super::recent::{self, Payload, Recent};
 use super::wire::{
     self, Alarm, Alarms, BeatEstimate, ChannelStatus, Event, Header, Members, ParameterEstimate, SCHEMA, StateEstimate,
     Status, ToJson,
@@ -36,7 +38,7 @@ const EVENTS: usize = 1024;
 /// Keys whose last value is kept.
 const MAX_LAST_VALUES: usize = 65_536;
 
-type LastStore = Arc<Mutex<HashMap<String, Vec<u8>>>>;
+type LastStore = Arc<Mutex<HashMap<String, Payload>>>;
 
 /// Publishes what beds put out.
 pub struct Outlet {
@@ -50,22 +52,21 @@ pub struct Outlet {
     waiting: Arc<AtomicUsize>,
     dropped: AtomicU64,
     last: LastStore,
+    recent: Arc<Recent>,
     sequences: Mutex<HashMap<String, u64>>,
     thread: Option<std::thread::JoinHandle<()>>,
-    _answers: Subscription,
+    _answers: [Subscription; 2],
 }
 
 impl Outlet {
-    /// Starts the publishing thread and offers last values.
+    /// Starts the publishing thread and offers last values and recent messages.
     ///
     /// # Errors
     /// When the bus does not take the offer.
     pub fn start(bus: Arc<dyn Bus>, config: &Config) -> Result<Self, BusError> {
-        let last = LastStore::default();
-        let offered = Arc::clone(&last);
-        // Keys of this service only; the pattern must not answer for the pressures.
-        let pattern = format!("{}/**", config.publish.prefix);
-        let answers = bus.offer_last_values(&pattern, Arc::new(move |asked| answer(&offered, asked)))?;
+        let (last, recent) = (LastStore::default(), Recent::start());
+        let prefix = config.publish.prefix.clone();
+        let answers = [offer_last_values(bus.as_ref(), &prefix, &last)?, recent.offer(bus.as_ref(), &prefix)?];
         let (queue, messages) = sync_channel(QUEUE + EVENTS);
         let waiting = Arc::<AtomicUsize>::default();
         let (publisher, left) = (Arc::clone(&bus), Arc::clone(&waiting));
@@ -75,7 +76,7 @@ impl Outlet {
             .map_err(|e| BusError::Transport(e.to_string()))?;
         Ok(Self {
             bus,
-            prefix: config.publish.prefix.clone(),
+            prefix,
             seed: config.estimator.seed,
             config_hash: config.hash(),
             json: config.publish.json,
@@ -84,10 +85,17 @@ impl Outlet {
             waiting,
             dropped: AtomicU64::new(0),
             last,
+            recent,
             sequences: Mutex::default(),
             thread: Some(thread),
             _answers: answers,
         })
+    }
+
+    /// What is remembered for recorders; whoever takes samples in feeds it as well.
+    #[must_use]
+    pub fn recent(&self) -> Arc<Recent> {
+        Arc::clone(&self.recent)
     }
 
     fn header(&self, key: &str, time: EventTime) -> Header {
@@ -111,20 +119,29 @@ impl Outlet {
             self.dropped.fetch_add(1, Ordering::Relaxed);
             return;
         };
-        {
-            let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
-            if let Some(value) = last.get_mut(&key) {
-                value.clone_from(&payload);
-            } else if last.len() < MAX_LAST_VALUES {
-                last.insert(key.clone(), payload.clone());
-            }
-        }
+        self.remember(&key, Payload::from(payload.as_slice()));
         let twin = format!("{key}/json");
         if self.json && self.bus.is_wanted(&twin) {
             let payload = message.to_json().to_string().into_bytes();
             self.queue(Message { key: twin, encoding: Encoding::Json, payload }, delivery);
         }
         self.queue(Message { key, encoding: Encoding::Bincode, payload }, delivery);
+    }
+
+    fn remember(&self, key: &str, payload: Payload) {
+        let topic = key.strip_prefix(&self.prefix).and_then(|rest| rest.splitn(3, '/').nth(2)).unwrap_or_default();
+        // Ensembles would take the place of much else.
+        if topic != "estimate/members"
+            && let Some(sequence) = wire::sequence(topic, &payload, Encoding::Bincode)
+        {
+            self.recent.keep(key, sequence, Encoding::Bincode, Arc::clone(&payload));
+        }
+        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(value) = last.get_mut(key) {
+            *value = payload;
+        } else if last.len() < MAX_LAST_VALUES {
+            last.insert(key.to_owned(), payload);
+        }
     }
 
     fn queue(&self, message: Message, delivery: Delivery) {
@@ -270,11 +287,18 @@ fn publish_all(bus: &dyn Bus, messages: &Receiver<(Message, Delivery)>, waiting:
     }
 }
 
-/// Last values under a pattern; the JSON twins are made on demand.
+fn offer_last_values(bus: &dyn Bus, prefix: &str, last: &LastStore) -> Result<Subscription, BusError> {
+    let (last, own) = (Arc::clone(last), prefix.to_owned());
+    // Requests for recent messages come here as well, and often; others answer them.
+    let answer = move |asked: &str| if recent::is_request(&own, asked) { Vec::new() } else { answer(&last, asked) };
+    bus.offer_last_values(&format!("{prefix}/**"), Arc::new(answer))
+}
+
+/// Last values under a pattern, of what this service says only; the JSON twins are made on demand.
 fn answer(store: &LastStore, asked: &str) -> Vec<Message> {
-    let values: Vec<(String, Vec<u8>)> = {
+    let values: Vec<(String, Payload)> = {
         let last = store.lock().unwrap_or_else(PoisonError::into_inner);
-        last.iter().map(|(key, payload)| (key.clone(), payload.clone())).collect()
+        last.iter().map(|(key, payload)| (key.clone(), Arc::clone(payload))).collect()
     };
     let mut out = Vec::new();
     for (key, payload) in values {
@@ -285,7 +309,7 @@ fn answer(store: &LastStore, asked: &str) -> Vec<Message> {
             out.push(Message { key: twin, encoding: Encoding::Json, payload: json });
         }
         if bus::matches(asked, &key) {
-            out.push(Message { key, encoding: Encoding::Bincode, payload });
+            out.push(Message { key, encoding: Encoding::Bincode, payload: payload.to_vec() });
         }
     }
     out

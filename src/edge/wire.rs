@@ -371,6 +371,35 @@ fn check_schema(version: u64) -> Result<(), WireError> {
     }
 }
 
+/// Sequence number of a message under a topic of a bed, without reading the rest of it where it is bincode. None where
+/// messages carry none, or it is too short or of another schema.
+#[must_use]
+pub fn sequence(topic: &str, payload: &[u8], encoding: Encoding) -> Option<u64> {
+    if topic.starts_with("pressure/") {
+        return match encoding {
+            Encoding::Bincode => number_at(payload, BLOCK_SEQUENCE),
+            Encoding::Json => decode_json::<Numbered>(payload).ok().map(|numbered| numbered.sequence),
+        };
+    }
+    let is_counted = topic.starts_with("estimate/") || topic == "status";
+    (is_counted && encoding == Encoding::Bincode).then(|| number_at(payload, HEADER_SEQUENCE)).flatten()
+}
+
+/// Where the sequence number is in a [`PressureBlock`], and in a message that begins with a [`Header`] \[bytes\].
+const BLOCK_SEQUENCE: usize = 2;
+const HEADER_SEQUENCE: usize = 18;
+
+/// What is needed of a block to count it.
+#[derive(Deserialize)]
+struct Numbered {
+    sequence: u64,
+}
+
+fn number_at(payload: &[u8], at: usize) -> Option<u64> {
+    check_schema(u64::from(u16::from_le_bytes(*payload.first_chunk()?))).ok()?;
+    Some(u64::from_le_bytes(*payload.get(at..)?.first_chunk()?))
+}
+
 /// The JSON twin of a published message.
 pub trait ToJson: Serialize {
     /// The same content, arranged by name.

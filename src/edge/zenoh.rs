@@ -183,6 +183,8 @@ impl Bus for ZenohBus {
             .session
             .get(pattern.to_owned())
             .consolidation(ConsolidationMode::None)
+            // Answers have that of the question: behind estimates those who miss some would wait until there are no more.
+            .priority(Priority::InteractiveHigh)
             .timeout(timeout)
             .wait()
             .map_err(transport)?;

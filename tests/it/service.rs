@@ -87,7 +87,7 @@ impl Daemon {
         let (service, inlet) =
             Service::new(config.circulation().unwrap(), settings, limits, workers, sink, Clock::start()).unwrap();
         let service = tokio::spawn(service.run());
-        subscriptions.extend(inlet::listen(&bus, config, inlet.clone()).unwrap());
+        subscriptions.extend(inlet::listen(&bus, config, inlet.clone(), outlet.recent()).unwrap());
         Self { bus, inlet, outlet, service, said, subscriptions }
     }
 

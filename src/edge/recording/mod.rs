@@ -13,8 +13,12 @@
 //! and the next start of a recorder removes them; somebody else who reads between a crash and that start sees their rows
 //! twice.
 //!
+//! Samples and estimates that the network dropped are asked for where the daemon remembers them, and take their place
+//! before anything is written; see [`gaps`].
+//!
 //! Deliberately absent: compaction over hours, retention, an index. What a bed is worth keeping is the user's business.
 
+pub mod gaps;
 pub mod layout;
 pub mod merge;
 pub mod playback;

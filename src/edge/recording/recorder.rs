@@ -3,11 +3,12 @@
 use std::collections::BTreeMap;
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use super::gaps::{Gaps, PATIENCE_NS, Request};
 use super::layout::{self, Part, Parts};
 use super::merge::{Job, Merger, merge};
 use super::tables::{self, BedMemory, Entry, Table};
@@ -36,6 +37,13 @@ const TOPICS: [&str; 12] = [
 ];
 /// Recorded if asked for: the whole ensemble is made only for those who subscribe.
 const MEMBERS: &str = "estimate/members";
+
+/// Threads that ask the daemon for what is missing, each for one gap at a time: when the link is busy an answer takes long,
+/// and many keys have gaps.
+const ASKERS: usize = 16;
+
+/// Gaps that wait for them; more are lost.
+const ASKED: usize = 1024;
 
 /// Messages between the bus and the recorder, and their bytes; more are dropped and counted.
 const QUEUE: usize = 1 << 17;
@@ -85,8 +93,10 @@ pub struct Summary {
     pub refused: BTreeMap<&'static str, u64>,
     /// Messages that found the queue full.
     pub dropped: u64,
-    /// Messages that sequence numbers say were sent and never came: samples and estimates are dropped by a network that
-    /// is busy. Those that found the queue full are among them.
+    /// Messages that did not come and were got from the daemon: samples and estimates are dropped by a network that is
+    /// busy. Those that found the queue full are among them.
+    pub recovered: u64,
+    /// Messages that sequence numbers say were sent, and that the daemon did not have.
     pub lost: u64,
 }
 
@@ -129,9 +139,10 @@ pub struct Recorder {
     units: Units,
     buffers: BTreeMap<(String, Table), Buffer>,
     beds: BTreeMap<String, BedMemory>,
+    /// Where messages wait for those that are missing.
+    gaps: Gaps,
     /// Cells in all buffers.
     cells: usize,
-    last_arrival: i64,
     summary: Summary,
     merger: Merger,
     /// Held for as long as this recorder writes here.
@@ -155,26 +166,65 @@ impl Recorder {
             units,
             buffers: BTreeMap::new(),
             beds: BTreeMap::new(),
+            gaps: Gaps::default(),
             cells: 0,
-            last_arrival: i64::MIN,
             summary: Summary::default(),
             merger,
             _lock: lock,
         })
     }
 
-    /// Takes a message that arrived at a unix time \[ns\]. No two messages share an arrival: one that is not after the last
-    /// gets the next nanosecond.
+    /// Takes a message that arrived at a unix time \[ns\]; it is recorded in its turn. No two messages share an arrival: one
+    /// that is not after the last gets the next nanosecond that is free.
     ///
     /// # Errors
     /// When the disk does not take what is due.
-    pub fn take(&mut self, message: &Message, arrival_ns: i64) -> Result<(), FileError> {
-        let Some((bed, topic)) = self.address(&message.key) else { return Ok(()) };
-        let (bed, topic) = (bed.to_owned(), topic.to_owned());
-        let arrival = arrival_ns.max(self.last_arrival.saturating_add(1));
-        self.last_arrival = arrival;
-        if let Err(cause) = self.add(&bed, &topic, message, arrival)? {
-            *self.summary.refused.entry(cause).or_default() += 1;
+    pub fn take(&mut self, message: Message, arrival_ns: i64) -> Result<(), FileError> {
+        let Some((_, topic)) = self.address(&message.key) else { return Ok(()) };
+        let sequence = wire::sequence(topic, &message.payload, message.encoding);
+        let is_kept = topic != MEMBERS;
+        self.gaps.take(message, sequence, is_kept, arrival_ns);
+        self.add_due()
+    }
+
+    /// What to ask the daemon for, if there is something.
+    pub fn request(&mut self) -> Option<Request> {
+        self.gaps.request()
+    }
+
+    /// Takes the answer to a request: messages under the key that was asked for.
+    ///
+    /// # Errors
+    /// When the disk does not take what is due.
+    pub fn answer(&mut self, id: u64, messages: Vec<Message>) -> Result<(), FileError> {
+        let numbered = messages.into_iter().filter_map(|message| {
+            let (_, topic) = self.address(&message.key)?;
+            Some((wire::sequence(topic, &message.payload, message.encoding)?, message))
+        });
+        let numbered = numbered.collect();
+        self.gaps.answer(id, numbered);
+        self.add_due()
+    }
+
+    /// No more messages come, only answers: there may be more requests.
+    pub fn end(&mut self) {
+        self.gaps.end();
+    }
+
+    /// Whether an answer is waited for.
+    #[must_use]
+    pub fn is_waiting(&self) -> bool {
+        self.gaps.is_waiting()
+    }
+
+    /// Makes rows of the messages whose turn it is.
+    fn add_due(&mut self) -> Result<(), FileError> {
+        while let Some((arrival, message)) = self.gaps.leave() {
+            let Some((bed, topic)) = self.address(&message.key) else { continue };
+            let (bed, topic) = (bed.to_owned(), topic.to_owned());
+            if let Err(cause) = self.add(&bed, &topic, &message, arrival)? {
+                *self.summary.refused.entry(cause).or_default() += 1;
+            }
         }
         Ok(())
     }
@@ -269,11 +319,14 @@ impl Recorder {
         if self.cells >= MAX_ALL_CELLS { self.write_all() } else { Ok(()) }
     }
 
-    /// Writes what has waited long enough by a unix time, and lets go of hours that are over.
+    /// Writes what has waited long enough by a unix time up to which all messages have been taken, and lets go of hours
+    /// that are over.
     ///
     /// # Errors
     /// When the disk does not take it.
     pub fn flush_due(&mut self, now_ns: i64) -> Result<(), FileError> {
+        self.gaps.advance(now_ns);
+        self.add_due()?;
         let flush_ns = ns_from_s(self.options.flush_s);
         let waits = |b: &Buffer| b.batch.rows() > 0 && now_ns.saturating_sub(b.since_ns) >= flush_ns;
         let due: Vec<_> = self.buffers.iter().filter(|(_, b)| waits(b)).map(|(key, _)| key.clone()).collect();
@@ -311,17 +364,19 @@ impl Recorder {
         Ok(())
     }
 
-    /// Writes what is left and merges what is small.
+    /// Writes what is left, gives up what is missing, and merges what is small.
     ///
     /// # Errors
     /// When the disk does not take it.
     pub fn close(mut self) -> Result<Summary, FileError> {
+        self.gaps.close();
+        self.add_due()?;
         self.write_all()?;
         for buffer in self.buffers.values() {
             let _ = self.merger.ask(Job { folder: buffer.folder.clone(), all: false });
         }
-        let lost = self.beds.values().fold(0_u64, |sum, bed| sum.saturating_add(bed.lost()));
-        Ok(Summary { beds: self.beds.len(), lost, ..self.summary })
+        let (recovered, lost) = (self.gaps.recovered(), self.gaps.lost());
+        Ok(Summary { beds: self.beds.len(), recovered, lost, ..self.summary })
     }
 }
 
@@ -421,39 +476,134 @@ pub fn run(
     progress: &mut dyn FnMut(u64, u64),
 ) -> Result<Summary, RecordError> {
     let clock = ArrivalClock::start();
-    let mut recorder = Recorder::open(directory, options.clone(), units, clock.now_ns())?;
+    let recorder = Recorder::open(directory, options.clone(), units, clock.now_ns())?;
     let (subscriptions, queue) = subscribe(bus, &options, clock)?;
-    let mut looked_ns = clock.now_ns();
-    let mut said = 0;
-    while !stop.load(Ordering::Relaxed) {
-        match queue.receiver.recv_timeout(LOOK) {
-            Ok((arrival, message)) => queue.record(&mut recorder, &message, arrival)?,
-            Err(RecvTimeoutError::Timeout) => {}
-            Err(RecvTimeoutError::Disconnected) => break,
+    let (requests, waiting) = sync_channel(ASKED);
+    let (found, answers) = sync_channel(ASKED);
+    let asker = Asker { bus, prefix: &options.prefix, requests: Mutex::new(waiting), answers: found };
+    std::thread::scope(|scope| {
+        for _ in 0..ASKERS {
+            scope.spawn(|| asker.work());
         }
-        let now_ns = clock.now_ns();
-        if now_ns - looked_ns >= i64::try_from(LOOK.as_nanos()).unwrap_or(0) {
-            looked_ns = now_ns;
-            recorder.flush_due(now_ns)?;
-            let dropped = queue.dropped.load(Ordering::Relaxed);
-            if dropped > said {
-                tracing::warn!(dropped, "messages were dropped because the disk was behind");
-                said = (2 * dropped).max(1);
-            }
-            progress(recorder.summary.rows.values().sum(), dropped);
-        }
-    }
-    drop(subscriptions);
-    while let Ok((arrival, message)) = queue.receiver.try_recv() {
-        queue.record(&mut recorder, &message, arrival)?;
-    }
-    let dropped = queue.dropped.load(Ordering::Relaxed);
-    Ok(Summary { dropped, ..recorder.close()? })
+        // The askers end when nobody asks and nobody listens any more: with this loop, however it ends.
+        let mut work = Loop { recorder, queue, requests, answers, clock, looked_ns: clock.now_ns(), said: 0 };
+        work.run(stop, progress)?;
+        drop(subscriptions);
+        work.finish()
+    })
 }
 
-impl Queue {
-    fn record(&self, recorder: &mut Recorder, message: &Message, arrival: i64) -> Result<(), FileError> {
-        self.bytes.fetch_sub(message.payload.len() + message.key.len(), Ordering::Relaxed);
-        recorder.take(message, arrival)
+/// The answer to a request, by its name.
+type Answer = (u64, Vec<Message>);
+
+/// Asks the daemon, on threads of its own: an answer may take a while.
+struct Asker<'a> {
+    bus: &'a dyn Bus,
+    prefix: &'a str,
+    requests: Mutex<Receiver<Request>>,
+    answers: SyncSender<Answer>,
+}
+
+impl Asker<'_> {
+    fn work(&self) {
+        loop {
+            let request = self.requests.lock().unwrap_or_else(PoisonError::into_inner).recv();
+            let Ok(request) = request else { return };
+            if self.answers.send((request.id, self.ask(&request))).is_err() {
+                return;
+            }
+        }
+    }
+
+    /// The messages that are there, under their own key.
+    fn ask(&self, request: &Request) -> Vec<Message> {
+        let Some(pattern) = request.missed.pattern(self.prefix) else { return Vec::new() };
+        let patience = Duration::from_nanos(PATIENCE_NS.unsigned_abs());
+        let answer = self.bus.last_values(&pattern, patience).unwrap_or_default();
+        answer.into_iter().map(|m| Message { key: request.missed.key.clone(), ..m }).collect()
+    }
+}
+
+/// The recorder at work.
+struct Loop {
+    recorder: Recorder,
+    queue: Queue,
+    requests: SyncSender<Request>,
+    /// Beside the queue: behind the messages in it they might come too late.
+    answers: Receiver<Answer>,
+    clock: ArrivalClock,
+    looked_ns: i64,
+    /// Dropped messages at which there will be a warning.
+    said: u64,
+}
+
+impl Loop {
+    fn run(&mut self, stop: &AtomicBool, progress: &mut dyn FnMut(u64, u64)) -> Result<(), FileError> {
+        while !stop.load(Ordering::Relaxed) {
+            let taken_ns = match self.queue.receiver.recv_timeout(LOOK) {
+                Ok((arrival, message)) => {
+                    self.take(message, arrival)?;
+                    arrival
+                }
+                // Nothing is on the way that arrived before.
+                Err(RecvTimeoutError::Timeout) => self.clock.now_ns(),
+                Err(RecvTimeoutError::Disconnected) => break,
+            };
+            self.ask_and_answer()?;
+            let now_ns = self.clock.now_ns();
+            if now_ns - self.looked_ns >= i64::try_from(LOOK.as_nanos()).unwrap_or(0) {
+                self.looked_ns = now_ns;
+                self.recorder.flush_due(taken_ns)?;
+                progress(self.recorder.summary.rows.values().sum(), self.warn());
+            }
+        }
+        Ok(())
+    }
+
+    fn take(&mut self, message: Message, arrival: i64) -> Result<(), FileError> {
+        self.queue.bytes.fetch_sub(message.payload.len() + message.key.len(), Ordering::Relaxed);
+        self.recorder.take(message, arrival)
+    }
+
+    /// Hands over what is to be asked for, and takes what was answered.
+    fn ask_and_answer(&mut self) -> Result<(), FileError> {
+        while let Some(request) = self.recorder.request() {
+            let id = request.id;
+            if self.requests.try_send(request).is_err() {
+                self.recorder.answer(id, Vec::new())?;
+            }
+        }
+        while let Ok((id, messages)) = self.answers.try_recv() {
+            self.recorder.answer(id, messages)?;
+        }
+        Ok(())
+    }
+
+    /// Messages that were dropped.
+    fn warn(&mut self) -> u64 {
+        let dropped = self.queue.dropped.load(Ordering::Relaxed);
+        if dropped > self.said {
+            tracing::warn!(dropped, "messages were dropped because the disk was behind");
+            self.said = (2 * dropped).max(1);
+        }
+        dropped
+    }
+
+    /// Takes what is left in the queue, waits for what is missing, and closes.
+    fn finish(mut self) -> Result<Summary, RecordError> {
+        while let Ok((arrival, message)) = self.queue.receiver.try_recv() {
+            self.take(message, arrival)?;
+            self.ask_and_answer()?;
+        }
+        self.recorder.end();
+        self.ask_and_answer()?;
+        let until_ns = self.clock.now_ns().saturating_add(PATIENCE_NS);
+        while self.recorder.is_waiting() && self.clock.now_ns() < until_ns {
+            if let Ok((id, messages)) = self.answers.recv_timeout(LOOK) {
+                self.recorder.answer(id, messages)?;
+            }
+        }
+        let dropped = self.queue.dropped.load(Ordering::Relaxed);
+        Ok(Summary { dropped, ..self.recorder.close()? })
     }
 }

@@ -114,34 +114,6 @@ pub struct BedMemory {
     event_time: Option<i64>,
     /// State of each alarm, and whether somebody has seen it.
     alarms: BTreeMap<String, (String, bool)>,
-    /// Sequence number last seen under each topic.
-    sequences: BTreeMap<String, u64>,
-    /// Messages that sequence numbers say were sent and never came.
-    lost: u64,
-}
-
-impl BedMemory {
-    /// Messages that were sent and never came.
-    #[must_use]
-    pub fn lost(&self) -> u64 {
-        self.lost
-    }
-
-    /// Counts what is missing before a message; a number that went back is that of a sender that began again.
-    fn count_lost(&mut self, topic: &str, sequence: u64) {
-        let has_room = self.sequences.len() < MAX_NAMES;
-        match self.sequences.get_mut(topic) {
-            Some(last) => {
-                let missing = sequence.checked_sub(*last).map_or(0, |step| step.saturating_sub(1));
-                self.lost = self.lost.saturating_add(missing);
-                *last = sequence;
-            }
-            None if has_room => {
-                self.sequences.insert(topic.to_owned(), sequence);
-            }
-            None => {}
-        }
-    }
 }
 
 /// Rows of a message that arrived under a topic of a bed.
@@ -163,27 +135,16 @@ pub fn entry(topic: &str, message: &Message, arrival: i64, bed: &mut BedMemory) 
             None => happenings(topic, message, &arrival, bed),
         },
     }?;
-    if let Some(sequence) = entry.number("sequence") {
-        bed.count_lost(topic, sequence.cast_unsigned());
-    }
     if matches!(entry.table, Table::Estimates | Table::Parameters) {
-        bed.event_time = bed.event_time.max(entry.number("time_ns"));
+        bed.event_time = bed.event_time.max(entry.time_ns());
     }
     Ok(entry)
 }
 
 impl Entry {
-    /// An integer of the last row, by the name of its column.
-    fn number(&self, name: &str) -> Option<i64> {
-        // Events are not dropped on the way, and several topics share their table.
-        let place = match (self.table, name) {
-            (Table::Samples, "sequence") => 2,
-            (Table::Samples | Table::Events | Table::Truth, _) => return None,
-            (_, "sequence") => 1,
-            (_, "time_ns") => 4,
-            _ => return None,
-        };
-        match self.rows.last()?.get(place)? {
+    /// Event time of the last row, where the daemon published it.
+    fn time_ns(&self) -> Option<i64> {
+        match self.rows.last()?.get(4)? {
             Cell::Int(number) => Some(*number),
             _ => None,
         }
