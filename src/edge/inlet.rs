@@ -163,7 +163,9 @@ pub fn listen(
         if let Some(event) = decoder.event(&message) {
             inlet.offer(event);
         }
-        if let Some(sequence) = decoder.sequence(&message) {
+        if recent.is_wanted()
+            && let Some(sequence) = decoder.sequence(&message)
+        {
             recent.keep(&message.key, sequence, message.encoding, message.payload.into());
         }
     });

@@ -55,7 +55,7 @@ pub struct Outlet {
     recent: Arc<Recent>,
     sequences: Mutex<HashMap<String, u64>>,
     thread: Option<std::thread::JoinHandle<()>>,
-    _answers: [Subscription; 2],
+    _answers: [Subscription; 3],
 }
 
 impl Outlet {
@@ -66,7 +66,8 @@ impl Outlet {
     pub fn start(bus: Arc<dyn Bus>, config: &Config) -> Result<Self, BusError> {
         let (last, recent) = (LastStore::default(), Recent::start());
         let prefix = config.publish.prefix.clone();
-        let answers = [offer_last_values(bus.as_ref(), &prefix, &last)?, recent.offer(bus.as_ref(), &prefix)?];
+        let [recent_answers, presence] = recent.offer(bus.as_ref(), &prefix)?;
+        let answers = [offer_last_values(bus.as_ref(), &prefix, &last)?, recent_answers, presence];
         let (queue, messages) = sync_channel(QUEUE + EVENTS);
         let waiting = Arc::<AtomicUsize>::default();
         let (publisher, left) = (Arc::clone(&bus), Arc::clone(&waiting));

@@ -10,12 +10,18 @@
 //!
 //! with the messages as they were, one reply each, all under the key of the request, in order. Who asks for `FROM/TO` got
 //! `TO + 1`, and who asks for the end got `FROM - 1`: these numbers say which run of a sender is meant that has begun again
-//! since. (`TO + 1` may have got to who asks a moment before it gets here.) Nothing is said to requests that are not understood, and of messages that never came or are forgotten.
+//! since. (`TO + 1` may have got to who asks a moment before it gets here.) Nothing is said to requests that are not
+//! understood, and of messages that never came or are forgotten.
+//!
+//! Remembering is a tenth of all that a daemon does, so that it does so for those only who say under `PREFIX/recorder`,
+//! once a second, that they are there.
 //!
 //! Deliberately absent: history. What is kept is bounded by age and bytes, the oldest goes first.
 
 use std::collections::{HashMap, VecDeque};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use super::bus::{Bus, BusError, Encoding, Message, Subscription};
 use crate::runtime::clock::Clock;
@@ -74,9 +80,22 @@ pub fn is_request(prefix: &str, asked: &str) -> bool {
 /// Bytes that several may hold on to.
 pub type Payload = Arc<[u8]>;
 
+/// Key under which those who may ask say that they are there.
+#[must_use]
+pub fn presence(prefix: &str) -> String {
+    format!("{prefix}/recorder")
+}
+
+/// Time between two such messages, and time after which who says nothing is gone.
+pub const PRESENT_EVERY: Duration = Duration::from_secs(1);
+const GONE_AFTER_NS: i64 = 10_000_000_000;
+
 /// Remembers; may be fed and asked from any thread.
 pub struct Recent {
     clock: Clock,
+    /// Until when somebody may ask \[ns\].
+    wanted_until_ns: AtomicI64,
+    is_empty: AtomicBool,
     memory: Mutex<Memory>,
 }
 
@@ -84,28 +103,54 @@ impl Recent {
     /// Remembers nothing yet.
     #[must_use]
     pub fn start() -> Arc<Self> {
-        Arc::new(Self { clock: Clock::start(), memory: Mutex::new(Memory::new(BOUNDS)) })
+        Arc::new(Self {
+            clock: Clock::start(),
+            wanted_until_ns: AtomicI64::new(i64::MIN),
+            is_empty: AtomicBool::new(true),
+            memory: Mutex::new(Memory::new(BOUNDS)),
+        })
     }
 
-    /// Remembers a message.
+    /// Whether somebody may ask; forgets everything once nobody does.
+    pub fn is_wanted(&self) -> bool {
+        let is_wanted = self.clock.now().0 < self.wanted_until_ns.load(Ordering::Relaxed);
+        if !is_wanted && !self.is_empty.swap(true, Ordering::Relaxed) {
+            *self.lock() = Memory::new(BOUNDS);
+        }
+        is_wanted
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Memory> {
+        self.memory.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Remembers a message, if it is wanted.
     pub fn keep(&self, key: &str, sequence: u64, encoding: Encoding, payload: Payload) {
-        let now_ns = self.clock.now().0;
-        let mut memory = self.memory.lock().unwrap_or_else(PoisonError::into_inner);
-        memory.keep(key, Remembered { sequence, encoding, payload }, now_ns);
+        if !self.is_wanted() {
+            return;
+        }
+        self.is_empty.store(false, Ordering::Relaxed);
+        self.lock().keep(key, Remembered { sequence, encoding, payload }, self.clock.now().0);
     }
 
-    /// Answers requests under `prefix` for as long as the subscription lives.
+    /// Answers requests under `prefix`, and hears who may ask, for as long as the subscriptions live.
     ///
     /// # Errors
-    /// When the bus does not take the offer.
-    pub fn offer(self: &Arc<Self>, bus: &dyn Bus, prefix: &str) -> Result<Subscription, BusError> {
+    /// When the bus does not take them.
+    pub fn offer(self: &Arc<Self>, bus: &dyn Bus, prefix: &str) -> Result<[Subscription; 2], BusError> {
         let (recent, own) = (Arc::clone(self), prefix.to_owned());
-        bus.offer_last_values(&format!("{prefix}/*/recent/**"), Arc::new(move |asked| recent.answer(&own, asked)))
+        let answers =
+            bus.offer_last_values(&format!("{prefix}/*/recent/**"), Arc::new(move |asked| recent.answer(&own, asked)))?;
+        let recent = Arc::clone(self);
+        let hear = move |_: Message| {
+            recent.wanted_until_ns.store(recent.clock.now().0.saturating_add(GONE_AFTER_NS), Ordering::Relaxed);
+        };
+        Ok([answers, bus.subscribe(&presence(prefix), Arc::new(hear))?])
     }
 
     fn answer(&self, prefix: &str, asked: &str) -> Vec<Message> {
         let Some(request) = Request::parse(prefix, asked) else { return Vec::new() };
-        let found = self.memory.lock().unwrap_or_else(PoisonError::into_inner).find(&request);
+        let found = self.lock().find(&request);
         // Copied outside the lock, which those who feed wait for.
         let message =
             |m: Remembered| Message { key: asked.to_owned(), encoding: m.encoding, payload: m.payload.to_vec() };
@@ -269,10 +314,8 @@ fn after<'a>(newest_first: impl Iterator<Item = &'a Remembered>, from: u64) -> V
 
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use super::*;
-    use crate::edge::bus::MemoryBus;
+    use crate::edge::bus::{Delivery, MemoryBus};
 
     const SMALL: Bounds = Bounds { age_ns: 100, bytes: 10_000, bytes_per_key: 1000, keys: 3 };
 
@@ -370,6 +413,11 @@ mod tests {
     fn answers_are_the_messages_under_the_key_of_the_request() {
         let (bus, recent) = (MemoryBus::new(), Recent::start());
         let offered = recent.offer(&bus, "p").unwrap();
+        recent.keep("p/bed1/pressure/ART", 1, Encoding::Json, vec![b'0'].into());
+        assert!(!recent.is_wanted(), "nobody is there");
+        let present = Message { key: presence("p"), encoding: Encoding::Bincode, payload: Vec::new() };
+        bus.publish(present, Delivery::Events).unwrap();
+        assert!(recent.is_wanted());
         for sequence in 0..4 {
             recent.keep("p/bed1/pressure/ART", sequence, Encoding::Json, vec![b'0'; 1 + sequence as usize].into());
         }

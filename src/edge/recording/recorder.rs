@@ -12,10 +12,11 @@ use super::gaps::{Gaps, PATIENCE_NS, Request};
 use super::layout::{self, Part, Parts};
 use super::merge::{Job, Merger, merge};
 use super::tables::{self, BedMemory, Entry, Table};
-use crate::edge::bus::{Bus, BusError, Handler, Message, Subscription};
+use crate::edge::bus::{Bus, BusError, Delivery, Encoding, Handler, Message, Subscription};
 use crate::edge::files::columnar::{Batch, Field, Writer};
 use crate::edge::files::error::FileError;
 use crate::edge::files::units::Units;
+use crate::edge::recent;
 use crate::edge::wire;
 use crate::estimate::time::ns_from_s;
 use crate::runtime::clock::{Clock, unix_time};
@@ -481,16 +482,38 @@ pub fn run(
     let (requests, waiting) = sync_channel(ASKED);
     let (found, answers) = sync_channel(ASKED);
     let asker = Asker { bus, prefix: &options.prefix, requests: Mutex::new(waiting), answers: found };
+    let (working, ended) = sync_channel(0);
     std::thread::scope(|scope| {
+        let prefix = &options.prefix;
+        scope.spawn(move || announce(bus, prefix, &ended));
         for _ in 0..ASKERS {
             scope.spawn(|| asker.work());
         }
-        // The askers end when nobody asks and nobody listens any more: with this loop, however it ends.
+        // These threads end when nobody asks and nobody listens any more: with this loop, however it ends.
+        let _working: SyncSender<()> = working;
         let mut work = Loop { recorder, queue, requests, answers, clock, looked_ns: clock.now_ns(), said: 0 };
         work.run(stop, progress)?;
         drop(subscriptions);
         work.finish()
     })
+}
+
+/// Tells daemons that somebody is here who may ask, until there is nobody at work any more.
+fn announce(bus: &dyn Bus, prefix: &str, ended: &Receiver<()>) {
+    let mut is_told = true;
+    loop {
+        let message = Message { key: recent::presence(prefix), encoding: Encoding::Bincode, payload: Vec::new() };
+        let told = bus.publish(message, Delivery::Events);
+        if let Err(error) = &told
+            && is_told
+        {
+            tracing::warn!(%error, "daemons are not told of this recorder; what the network drops is lost");
+        }
+        is_told = told.is_ok();
+        if ended.recv_timeout(recent::PRESENT_EVERY) != Err(RecvTimeoutError::Timeout) {
+            return;
+        }
+    }
 }
 
 /// The answer to a request, by its name.
