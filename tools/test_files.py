@@ -318,9 +318,12 @@ class Recordings(RecordingCase):
         more = ("window.allowed_lateness_s=600", "publish.rate_hz=200")
         self.restart_daemon(*more)
         said, first = self.recorded("--seconds", "10", "--beds", "6", "--bed", "icu", stall_s=STALL_S)
-        self.assertGreater(self.count("the daemon gave again", said), 0, said)
-        if (lost := self.count("never came, by their sequence numbers", said)) > 0:
-            self.skipTest(f"the machine is too busy for a recording without a loss: {lost} messages")
+        recovered, lost = self.count("the daemon gave again", said), self.count("never came, by their sequence numbers", said)
+        self.assertGreater(recovered, 0, said)
+        if lost > 0:
+            # A machine that is busy with other things may take longer for an answer than a recorder waits.
+            self.assertLess(lost, 0.01 * recovered, said)
+            return
         self.recording.rename(self.folder / "first")
         self.restart_daemon(*more)
         said, second = self.recorded("--recording", "first", stall_s=0.0)

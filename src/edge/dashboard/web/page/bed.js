@@ -1,4 +1,4 @@
-// A bed: keeps its history and lets the panels show it. Strips go on with every frame, numbers four times a second, charts
+// A bed: keeps its history and lets the panels show it. Strips go on with every frame, numbers twice a second, charts
 // about once.
 
 import { AlarmList } from "./alarmlist.js";
@@ -24,9 +24,9 @@ import { Viewport } from "./viewport.js";
 
 /** Points of a waveform need not be closer than this [ms]. */
 const SPACING_MS = 8;
-const WRITE_EVERY_MS = 250;
+const WRITE_EVERY_MS = 500;
 /** What is out of sight is written with one of so many writes: somebody may have it read out. */
-const WRITES_PER_UNSEEN = 8;
+const WRITES_PER_UNSEEN = 4;
 
 export class Bed {
   /** `show(wish)` and `send(order)` reach the server, `changed()` asks for a picture. */
@@ -42,7 +42,7 @@ export class Bed {
     this.markers = [];
     this.viewport = new Viewport();
     this.timeline = new Timeline(this.viewport);
-    this.strips = new Strips({ onChoice: () => this.#ask(), onResize: changed });
+    this.strips = new Strips({ onChoice: () => this.#ask(), onClear: changed });
     this.history = new History(this.strips.quantities());
     this.numerics = new Numerics();
     this.sources = new Sources();

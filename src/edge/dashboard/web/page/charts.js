@@ -4,13 +4,13 @@
 import { isInSight, unwatch, watch } from "./sight.js";
 import { color, onTheme } from "./theme.js";
 
-/** Between two charts; with about six charts in sight each is two seconds old at most. */
+/** Between two charts; on a fast machine with six charts in sight each is a second old at most. */
 const TURN_MS = 160;
 /** A chart is not drawn more often than this. */
-const LEAST_AGE_MS = 1500;
+const LEAST_AGE_MS = 1000;
 
 /** After a chart the strips have the machine for so many times as long as it took. */
-const REST = 8;
+const REST = 30;
 
 let plotly = null;
 

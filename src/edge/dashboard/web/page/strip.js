@@ -1,4 +1,4 @@
-// A strip: the canvas of one quantity, and beside it what it is, where it comes from, and its value.
+// A strip: the waveform of one quantity, and beside it what it is, where it comes from, and its value.
 
 import { element, setAttribute, setText } from "./dom.js";
 import { describe } from "./names.js";
@@ -15,15 +15,18 @@ const ORIGINS = { observed: "● observed", silent: "◌ sensor silent", inferre
 const FIT_EVERY_S = 1;
 
 export class Strip {
-  constructor(name) {
+  /** A strip on a sheet. */
+  constructor(name, sheet) {
     this.name = name;
+    this.sheet = sheet;
+    this.area = null;
     this.about = describe(name);
     this.scale = new Scale();
     this.span = 0;
     this.paintedTo = -Infinity;
     this.lookOfPainted = null;
     this.fittedAt = -Infinity;
-    this.canvas = element("canvas", { "data-testid": `strip-${name}`, role: "img" });
+    this.plot = element("div", { class: "strip-plot", "data-testid": `strip-${name}`, role: "img" });
     this.origin = element("span", { class: "origin" });
     this.main = element("span", { class: "strip-main" });
     this.side = element("span", { class: "strip-side" });
@@ -38,11 +41,7 @@ export class Strip {
       ...(this.isPressure ? [value, this.band] : [value]),
       this.instant,
     );
-    const plot = element("div", { class: "strip-plot" }, this.canvas);
-    this.node = element("div", { class: "strip", style: `--hue: var(--${this.about.color})` }, plot, numbers);
-    this.plot = plot;
-    this.resizing = new ResizeObserver(() => this.#resize());
-    this.resizing.observe(plot);
+    this.node = element("div", { class: "strip", style: `--hue: var(--${this.about.color})` }, this.plot, numbers);
   }
 
   get isPressure() {
@@ -55,27 +54,17 @@ export class Strip {
     this.lookOfPainted = null;
   }
 
-  /** Takes the strip off the page. */
-  remove() {
-    this.resizing.disconnect();
-    this.node.remove();
-  }
-
-  #resize() {
-    this.ratio = window.devicePixelRatio || 1;
-    this.width = Math.max(this.plot.clientWidth, 60);
-    this.height = Math.max(this.plot.clientHeight, 30);
-    this.canvas.width = Math.round(this.width * this.ratio);
-    this.canvas.height = Math.round(this.height * this.ratio);
+  /** Its place on the sheet is empty, and may be another one. */
+  clear() {
+    this.area = null;
     this.lookOfPainted = null;
-    this.onResize?.();
   }
 
-  /** Paints what is not on the canvas yet: what came after what was painted last or is not what it was any more, from
+  /** Paints what is not on the sheet yet: what came after what was painted last or is not what it was any more, from
    * `changedFrom` on, or everything where it looks different. Returns whether there was anything. `options` are
    * `markers`, `withLabels`, `showSamples`, `showTruth`. */
   draw(history, viewport, changedFrom, options) {
-    if (!this.width) this.#resize();
+    this.area ??= this.sheet.areaOf(this.plot);
     this.#fit(history.estimate, viewport);
     const picture = this.#picture(viewport, options);
     const look = lookOf(picture, viewport);
@@ -84,7 +73,7 @@ export class Strip {
     if (from >= viewport.right) return false;
     this.lookOfPainted = look;
     this.paintedTo = viewport.right;
-    const ctx = this.#context(this.canvas);
+    const ctx = this.sheet.contextOf(this.area);
     if (!isSame) paintAxis(ctx, picture);
     for (const region of viewport.regions()) {
       if (region.to > from) paintRegion(ctx, history, this.name, { ...region, from: Math.max(region.from, from) }, picture);
@@ -101,7 +90,7 @@ export class Strip {
     const account = { points: 0, bandPoints: 0, samples: 0, low: null, high: null, left, right };
     const picture = this.#picture(viewport, options);
     for (const region of viewport.regions()) {
-      const painted = paintRegion(this.#context(this.canvas), history, this.name, region, picture);
+      const painted = paintRegion(this.sheet.contextOf(this.area), history, this.name, region, picture);
       for (const key of ["points", "bandPoints", "samples"]) account[key] += painted[key];
     }
     const { estimate } = history;
@@ -113,24 +102,19 @@ export class Strip {
 
   /** A picture of its own of the same time, from edge to edge. */
   stretched(history, viewport, options) {
-    const canvas = element("canvas", { width: this.canvas.width, height: this.canvas.height });
+    const { width, height, ratio } = this.area;
+    const canvas = element("canvas", { width: Math.round(width * ratio), height: Math.round(height * ratio) });
     const picture = { ...this.#picture(viewport, options), gap: 0 };
-    const ctx = this.#context(canvas);
+    const ctx = canvas.getContext("2d", { alpha: false });
+    ctx.scale(ratio, ratio);
     paintAxis(ctx, picture);
     for (const region of viewport.stretch()) paintRegion(ctx, history, this.name, region, picture);
     return canvas;
   }
 
-  #context(canvas) {
-    const ctx = canvas.getContext("2d", { alpha: false });
-    const [x, y] = [canvas.width / this.width, canvas.height / this.height];
-    ctx.setTransform(x, 0, 0, y, 0, 0);
-    return ctx;
-  }
-
   #picture({ span, gap }, options) {
-    const { width, height, ratio, scale } = this;
-    return { ...options, span, gap, width, height, ratio, scale, palette: paletteOf(this.about.color) };
+    const { width, height, ratio } = this.area;
+    return { ...options, span, gap, width, height, ratio, scale: this.scale, palette: paletteOf(this.about.color) };
   }
 
   // Whether the scale is too wide is looked at now and then, whether it is too narrow whenever there is something new.
@@ -164,11 +148,11 @@ export class Strip {
       setText(this.side, reading.side);
       setText(this.band, reading.band);
       setText(this.instant, `now ${instant}`);
-      setAttribute(this.canvas, "aria-label", `${this.about.text}: ${reading.main} ${reading.side} mmHg`);
+      setAttribute(this.plot, "aria-label", `${this.about.text}: ${reading.main} ${reading.side} mmHg`);
     } else {
       setText(this.main, number(at("mean"), digits));
       setText(this.instant, row < 0 ? NONE : `${spread(low, high, digits)} ${this.about.unit}`);
-      setAttribute(this.canvas, "aria-label", `${this.about.text}: ${instant}`);
+      setAttribute(this.plot, "aria-label", `${this.about.text}: ${instant}`);
     }
   }
 
@@ -178,7 +162,7 @@ export class Strip {
     setText(this.side, "");
     setText(this.band, "");
     setText(this.instant, was);
-    setAttribute(this.canvas, "aria-label", `${this.about.text}: no current value`);
+    setAttribute(this.plot, "aria-label", `${this.about.text}: no current value`);
   }
 }
 

@@ -4,6 +4,7 @@ import { byId, element, recall, remember } from "./dom.js";
 import { between } from "./markers.js";
 import { closeByItself } from "./menu.js";
 import { describe, FLOW_NAMES, PRESSURES, VOLUMES } from "./names.js";
+import { Sheet } from "./sheet.js";
 import { Strip } from "./strip.js";
 
 const GROUPS = [["Pressures", PRESSURES], ["Flows", FLOW_NAMES], ["Volumes", VOLUMES]];
@@ -12,15 +13,18 @@ const ALL = GROUPS.flatMap(([, names]) => names);
 const OF_LOOPS = ["p_l", "v_l", "p_r", "v_r"];
 
 export class Strips {
-  /** `onChoice()` is called when other quantities are wanted, `onResize()` when a canvas was emptied by a new size. */
-  constructor({ onChoice, onResize }) {
+  /** `onChoice()` is called when other quantities are wanted, `onClear()` when there is nothing on the sheet any more. */
+  constructor({ onChoice, onClear }) {
     this.list = byId("strips");
     this.strips = new Map();
-    this.onResize = onResize;
+    this.sheet = new Sheet(this.list, () => {
+      for (const strip of this.strips.values()) strip.clear();
+      onClear();
+    });
     this.chosen = storedChoice();
     this.showSamples = byId("show-samples");
     this.showTruth = byId("show-truth");
-    for (const box of [this.showSamples, this.showTruth]) box.addEventListener("change", onResize);
+    for (const box of [this.showSamples, this.showTruth]) box.addEventListener("change", onClear);
     this.#offer(onChoice);
     closeByItself(byId("strip-menu"));
     this.#arrange();
@@ -101,17 +105,17 @@ export class Strips {
   #arrange() {
     for (const [name, strip] of this.strips) {
       if (this.chosen.includes(name)) continue;
-      strip.remove();
+      strip.node.remove();
       this.strips.delete(name);
     }
     const arranged = new Map();
     for (const name of this.chosen) {
-      const strip = this.strips.get(name) ?? new Strip(name);
-      strip.onResize = this.onResize;
+      const strip = this.strips.get(name) ?? new Strip(name, this.sheet);
       arranged.set(name, strip);
       this.list.append(strip.node);
     }
     this.strips = arranged;
+    this.sheet.clear();
   }
 }
 
