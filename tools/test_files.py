@@ -350,10 +350,14 @@ class LongRecording(RecordingCase):
         self.assertIn("messages dropped: 0", said)
 
         samples = pd.read_parquet(self.recording / "samples")
+        # The end of a record is a row without a value.
+        samples = samples[samples["value"].notna()]
+        self.assertEqual(samples.groupby(["bed", "channel"], observed=True).ngroups, 2 * beds)
         for (bed, channel), rows in samples.groupby(["bed", "channel"], observed=True):
             times = np.sort(rows["time_ns"].to_numpy())
-            self.assertEqual(len(times), 60 * minutes * rate_hz, f"{bed} {channel}")
+            # None is missing and none is there twice; the last block may reach beyond the end.
             self.assertEqual(set(np.diff(times)), {1_000_000_000 // rate_hz}, f"{bed} {channel}")
+            self.assertGreaterEqual(len(times), 60 * minutes * rate_hz, f"{bed} {channel}")
         pattern = self.recording / "estimates" / "**" / "*.parquet"
         query = "select bed, count(distinct time_ns), (max(time_ns) - min(time_ns)) / 1e9, avg(p_a_q95 - p_a_q05) from "
         query += f"read_parquet('{pattern}', hive_partitioning = true) group by bed"
