@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 import unittest
+from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from hemostream_wire import (
@@ -37,6 +40,8 @@ from hemostream_wire import (
     differences,
     from_json,
 )
+
+README = Path(__file__).resolve().parent.parent / "README.md"
 
 
 def u64(value: int) -> bytes:
@@ -335,6 +340,20 @@ class Contents(unittest.TestCase):
         self.assertEqual(block.encode(), payload)
         np.testing.assert_array_equal(block.times_ns(), [-5, -2, 5])
         np.testing.assert_array_equal(block.values, values)
+
+    def test_the_readme_publishes_blocks_as_they_are_read(self) -> None:
+        code = re.search(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
+        self.assertIsNotNone(code)
+        zenoh = mock.MagicMock()
+        names = {"blocks_of_your_monitor": lambda: [[80.5, 81.5]]}
+        with mock.patch.dict("sys.modules", zenoh=zenoh):
+            exec(code[1] if code else "", names)
+        (key, payload), options = zenoh.open.return_value.__enter__.return_value.put.call_args
+        self.assertRegex(key, r"^hemostream/[^/]+/pressure/ABP$")
+        self.assertEqual(options, {"encoding": "application/json"})
+        block = from_json(PressureBlock, payload)
+        np.testing.assert_array_equal(block.values, [80.5, 81.5])
+        self.assertEqual(list(np.diff(block.times_ns())), [8_000_000])
 
     def test_pressure_block_refuses_what_does_not_fit(self) -> None:
         with self.assertRaisesRegex(Malformed, "2 offsets for 1 samples"):
