@@ -90,6 +90,9 @@ pub fn presence(prefix: &str) -> String {
 pub const PRESENT_EVERY: Duration = Duration::from_secs(1);
 const GONE_AFTER_NS: i64 = 10_000_000_000;
 
+/// Time for which a daemon that starts takes somebody to be there: who is has said so by then.
+const FIRST_NS: i64 = 2_000_000_000;
+
 /// Remembers; may be fed and asked from any thread.
 pub struct Recent {
     clock: Clock,
@@ -103,9 +106,14 @@ impl Recent {
     /// Remembers nothing yet.
     #[must_use]
     pub fn start() -> Arc<Self> {
+        Self::wanted_for(FIRST_NS)
+    }
+
+    fn wanted_for(time_ns: i64) -> Arc<Self> {
+        let clock = Clock::start();
         Arc::new(Self {
-            clock: Clock::start(),
-            wanted_until_ns: AtomicI64::new(i64::MIN),
+            clock,
+            wanted_until_ns: AtomicI64::new(clock.now().0.saturating_add(time_ns)),
             is_empty: AtomicBool::new(true),
             memory: Mutex::new(Memory::new(BOUNDS)),
         })
@@ -411,7 +419,7 @@ mod tests {
 
     #[test]
     fn answers_are_the_messages_under_the_key_of_the_request() {
-        let (bus, recent) = (MemoryBus::new(), Recent::start());
+        let (bus, recent) = (MemoryBus::new(), Recent::wanted_for(0));
         let offered = recent.offer(&bus, "p").unwrap();
         recent.keep("p/bed1/pressure/ART", 1, Encoding::Json, vec![b'0'].into());
         assert!(!recent.is_wanted(), "nobody is there");
