@@ -6,7 +6,6 @@ over, unless HEMOSTREAM_REQUIRED is 1.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import re
@@ -188,7 +187,14 @@ class RecordingCase(WithProgram):
 
     def rows(self, table: str) -> int:
         folder = self.recording / table
-        return len(pd.read_parquet(folder)) if folder.is_dir() else 0
+        until = time.monotonic() + PATIENCE_S
+        while folder.is_dir():
+            # A merge may remove a file between the listing of a folder and its reading.
+            try:
+                return len(pd.read_parquet(folder))
+            except FileNotFoundError:
+                self.assertLess(time.monotonic(), until, f"{table} cannot be read")
+        return 0
 
     def wait_for(self, table: str, rows: int) -> None:
         until = time.monotonic() + PATIENCE_S
@@ -196,9 +202,7 @@ class RecordingCase(WithProgram):
         while found < rows:
             self.assertLess(time.monotonic(), until, f"{found} rows in {table}, expected {rows}")
             time.sleep(0.1)
-            # A merge may remove a file between the listing of a folder and its reading.
-            with contextlib.suppress(FileNotFoundError):
-                found = self.rows(table)
+            found = self.rows(table)
 
     def count(self, of: str, said: str) -> int:
         """A number that the recorder said; 0 where it said nothing of the kind."""
