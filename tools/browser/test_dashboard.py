@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import statistics
+import struct
 import sys
 import time
 import unittest
@@ -280,6 +281,19 @@ class Watching(DemoCase):
             self.assertTrue(all(low <= mean <= high for low, mean, high in bands), name)
         self.assertTrue(any(row["p_a_sample"] for row in rows) and any(row["p_v_truth"] for row in rows))
         self.assertNotIn("p_v_sample", rows[0])
+
+    def test_what_is_shown_downloads_as_a_picture(self) -> None:
+        page = self.open(f"#bed/{CALM_BED}")
+        drawn(page)
+        shown = page.locator("#strips canvas").bounding_box()
+        with page.expect_download() as waiting:
+            page.locator("#export-png").click()
+        picture = Path(waiting.value.path()).read_bytes()
+        self.assertTrue(picture.startswith(b"\x89PNG"))
+        width, height = struct.unpack(">II", picture[16:24])
+        self.assertGreater(width, 400)
+        self.assertGreater(height, 0.9 * (shown["height"] if shown else 0))
+        self.assertGreater(len(picture), 20_000, "more than a blank sheet")
 
     def test_the_ward_downloads_as_csv(self) -> None:
         page = self.open()

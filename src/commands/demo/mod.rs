@@ -108,7 +108,6 @@ impl Demo {
         })
     }
 
-    /// The address asked for; without one a port of its own if the usual one is taken.
     /// Replays and shows until it ends; then the summary.
     fn show(&self, config: &Config, sets: &[String], bus: &ZenohBus, stop: &Arc<AtomicBool>) -> Result<(), Failure> {
         let boards = Shared::default();

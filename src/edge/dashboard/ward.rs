@@ -121,12 +121,10 @@ impl Ward {
     /// The ward of a daemon with this configuration: its topics, its labels.
     pub(super) fn of(config: &Config, memory: Memory) -> Self {
         let mut ward = Self::new(&config.publish.prefix, memory);
-        let known = config.labels.keys().filter_map(|label| {
-            let state = config.state_of_label(label)?;
-            Some((label.clone(), *ward.labels.get(state)?))
-        });
-        let known: Vec<_> = known.collect();
-        ward.labels.extend(known);
+        for label in config.labels.keys() {
+            let pressure = config.state_of_label(label).and_then(|state| ward.labels.get(state).copied());
+            ward.labels.extend(pressure.map(|pressure| (label.clone(), pressure)));
+        }
         ward
     }
 

@@ -55,7 +55,8 @@ const FRAME: Duration = Duration::from_millis(55);
 /// Longest work on messages between two pictures, so that keys are obeyed under any load.
 const SHARE: Duration = Duration::from_millis(30);
 
-/// Shows the beds of a daemon with this configuration, `bed` first, until a key or `stop` ends it; `author` signs notes and acknowledgements.
+/// Shows the beds of a daemon with this configuration, `bed` first, until a key or `stop` ends it; `author` signs notes
+/// and acknowledgements.
 ///
 /// # Errors
 /// When the bus refuses the subscription or the terminal does not work.

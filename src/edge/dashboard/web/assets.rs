@@ -36,9 +36,9 @@ pub(super) const DOCUMENT: [Asset; 2] = [
 pub(super) const MODULES: &[Asset] = &modules![
     "alarmlist.js" "alarms.js" "app.js" "bed.js" "charts.js" "commands.js" "connection.js" "dom.js" "eventlog.js"
     "export.js" "frame.js" "health.js" "history.js" "liveness.js" "loops.js" "markers.js" "menu.js" "meter.js" "names.js"
-    "numbers.js" "numerics.js" "outline.js" "pace.js" "paint.js" "palette.js" "readings.js" "runs.js" "scale.js" "series.js" "sheet.js"
-    "sight.js" "sources.js" "strip.js" "strips.js" "theme.js" "tile.js" "time.js" "timeline.js" "trendfigure.js" "trends.js"
-    "truth.js" "viewport.js" "ward.js"
+    "numbers.js" "numerics.js" "outline.js" "pace.js" "paint.js" "palette.js" "readings.js" "runs.js" "scale.js"
+    "series.js" "sheet.js" "sight.js" "sources.js" "strip.js" "strips.js" "theme.js" "tile.js" "time.js" "timeline.js"
+    "trendfigure.js" "trends.js" "truth.js" "viewport.js" "ward.js"
 ];
 
 /// plotly.js, as the crate `plotly` carries it; empty if it no longer carries it so.

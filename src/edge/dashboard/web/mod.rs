@@ -58,7 +58,8 @@ pub struct Web {
 }
 
 impl Web {
-    /// Starts serving the beds of a daemon with this configuration; `topics` says whether with the page, or metrics and health alone. Needs a tokio runtime.
+    /// Starts serving the beds of a daemon with this configuration; `topics` says whether with the page, or metrics and
+    /// health alone. Needs a tokio runtime.
     ///
     /// # Errors
     /// When the listener or the system does not work.

@@ -27,7 +27,8 @@ export class AlarmList {
     setText(byId("alarm-answer"), this.onAcknowledge(name) ? "" : "Not sent: the connection is lost.");
   }
 
-  /** Shows the alarms, and beside those that are raised what is now, from `bandNow(quantity)`; a list that did not change is left alone, so that no button moves away under the pointer. */
+  /** Shows the alarms, and beside those that are raised what is now, from `bandNow(quantity)`. A list that did not change
+   * is left alone, so that no button moves away under the pointer. */
   write(alarms, bandNow) {
     this.bandNow = bandNow;
     this.#writeNow();

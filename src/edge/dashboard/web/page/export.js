@@ -70,8 +70,8 @@ const NUMBERS_PX = 190;
 /** Strips and pictures of them on one picture, with the bed, the time and the numbers. */
 export function stripsPng(bed, viewport, pictures) {
   const ratio = window.devicePixelRatio || 1;
-  const width = Math.max(...pictures.map(([strip]) => strip.width)) + NUMBERS_PX;
-  const height = HEAD_PX + pictures.reduce((sum, [strip]) => sum + strip.height + 6, 0);
+  const width = Math.max(...pictures.map(([strip]) => strip.area.width)) + NUMBERS_PX;
+  const height = HEAD_PX + pictures.reduce((sum, [strip]) => sum + strip.area.height + 6, 0);
   const canvas = element("canvas", { width: Math.round(width * ratio), height: Math.round(height * ratio) });
   const ctx = canvas.getContext("2d");
   ctx.scale(ratio, ratio);
@@ -86,13 +86,14 @@ export function stripsPng(bed, viewport, pictures) {
   write(`${bed}   ${when}   lines: mean, bands: 5–95 %`, 10, 22, "600 14px", color("ink"));
   let y = HEAD_PX;
   for (const [strip, picture] of pictures) {
-    ctx.drawImage(picture, 0, y, strip.width, strip.height);
-    const x = strip.width + 10;
+    const { width: across, height: down } = strip.area;
+    ctx.drawImage(picture, 0, y, across, down);
+    const x = across + 10;
     write(`${strip.about.label}  ${strip.origin.textContent}`, x, y + 16, "600 12px", color("ink"));
     write(`${strip.main.textContent} ${strip.side.textContent}`, x, y + 38, "600 18px", color(strip.about.color));
     write(strip.band.textContent, x, y + 55, "11px", color("quiet"));
     write(strip.instant.textContent, x, y + 70, "11px", color("quiet"));
-    y += strip.height + 6;
+    y += down + 6;
   }
   return new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
 }

@@ -64,35 +64,36 @@ export class Strip {
    * `changedFrom` on, or everything where it looks different. Returns whether there was anything. `options` are
    * `markers`, `withLabels`, `showSamples`, `showTruth`. */
   draw(history, viewport, changedFrom, options) {
+    return this.#paint(history, viewport, changedFrom, options) !== null;
+  }
+
+  // What was painted is counted; null where there was nothing to paint.
+  #paint(history, viewport, changedFrom, options) {
     this.area ??= this.sheet.areaOf(this.plot);
     this.#fit(history.estimate, viewport);
     const picture = this.#picture(viewport, options);
     const look = lookOf(picture, viewport);
     const isSame = this.lookOfPainted !== null && look.every((part, k) => part === this.lookOfPainted[k]);
     const from = isSame ? Math.min(changedFrom, this.paintedTo) : -Infinity;
-    if (from >= viewport.right) return false;
+    if (from >= viewport.right) return null;
     this.lookOfPainted = look;
     this.paintedTo = viewport.right;
     const ctx = this.sheet.contextOf(this.area);
     if (!isSame) paintAxis(ctx, picture);
-    for (const region of viewport.regions()) {
-      if (region.to > from) paintRegion(ctx, history, this.name, { ...region, from: Math.max(region.from, from) }, picture);
+    const account = { points: 0, bandPoints: 0, samples: 0 };
+    for (const region of viewport.regions().filter(({ to }) => to > from)) {
+      const painted = paintRegion(ctx, history, this.name, { ...region, from: Math.max(region.from, from) }, picture);
+      for (const key of Object.keys(account)) account[key] += painted[key];
     }
-    return true;
+    return account;
   }
 
   /** Paints everything anew, and says what that was: rows of the estimate, how many have a band, the newest band,
    * samples, the share of the truth within the band. For tests. */
   drawAnew(history, viewport, options) {
     this.lookOfPainted = null;
-    this.draw(history, viewport, -Infinity, options);
     const { left, right } = viewport;
-    const account = { points: 0, bandPoints: 0, samples: 0, low: null, high: null, left, right };
-    const picture = this.#picture(viewport, options);
-    for (const region of viewport.regions()) {
-      const painted = paintRegion(this.sheet.contextOf(this.area), history, this.name, region, picture);
-      for (const key of ["points", "bandPoints", "samples"]) account[key] += painted[key];
-    }
+    const account = { ...this.#paint(history, viewport, -Infinity, options), left, right };
     const { estimate } = history;
     const newest = estimate.at(right);
     for (const part of ["low", "high"]) account[part] = newest < 0 ? null : (estimate.column(`${this.name}.${part}`)?.[newest] ?? null);
