@@ -1,6 +1,6 @@
 //! Eight members side by side: numbers in lanes, the instruction set that works on them, and equations written for them.
 //!
-//! Arithmetic is plain loops over arrays of eight, which the compiler turns into vector instructions where
+//! Arithmetic is written out for arrays of eight, which the compiler turns into vector instructions where
 //! [`InstructionSet::run`] has told it that they exist. There is no fused multiply-add: every instruction set rounds
 //! alike, so that the same input gives the same bits on every machine.
 
@@ -14,6 +14,20 @@ pub const WIDTH: usize = 8;
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[repr(align(64))]
 pub struct Lanes(pub [f64; WIDTH]);
+
+/// The same for every lane. Written out: kernels would hold thousands of loops, and unrolling them is what the compiler
+/// would spend most of a build on.
+macro_rules! lanes {
+    ($lane:ident => $value:expr) => {
+        lanes!($lane => $value; 0 1 2 3 4 5 6 7)
+    };
+    ($lane:ident => $value:expr; $($index:literal)+) => {
+        Lanes([$({
+            let $lane: usize = $index;
+            $value
+        }),+])
+    };
+}
 
 // All of these are a few instructions, and have to end up in the function that was compiled for the instruction set.
 #[allow(clippy::inline_always)]
@@ -32,15 +46,6 @@ impl Lanes {
         let mut out = self;
         for value in &mut out.0 {
             *value = f(*value);
-        }
-        out
-    }
-
-    #[inline(always)]
-    fn zip(self, other: Self, f: impl Fn(f64, f64) -> f64) -> Self {
-        let mut out = self;
-        for (value, other) in out.0.iter_mut().zip(&other.0) {
-            *value = f(*value, *other);
         }
         out
     }
@@ -217,7 +222,11 @@ impl Lanes {
     #[must_use]
     #[inline(always)]
     pub fn larger(self, other: Self) -> Self {
-        self.zip(other, |a, b| if a > b { a } else { b })
+        let mut out = self;
+        for (value, other) in out.0.iter_mut().zip(&other.0) {
+            *value = if *value > *other { *value } else { *other };
+        }
+        out
     }
 
     /// Whether no lane is above a limit; false where one is no number.
@@ -236,7 +245,7 @@ macro_rules! arithmetic {
                 type Output = Self;
                 #[inline(always)]
                 fn $function(self, other: Self) -> Self {
-                    self.zip(other, |a, b| a $operator b)
+                    lanes!(l => self.0[l] $operator other.0[l])
                 }
             }
         )+
