@@ -340,13 +340,16 @@ class Recordings(RecordingCase):
 class LongRecording(RecordingCase):
     RATE_HZ = 5
     daemon_settings = (f"publish.rate_hz={RATE_HZ}", "window.length_s=0.02")
+    # At so many times the pace of the patients, with an unoptimised build: fewer and bigger blocks and files.
+    SPEED, BLOCK_S, FLUSH_S = "15", "0.4", 6.0
 
     def test_ten_beds_for_ten_minutes_are_read_by_pandas_and_duckdb(self) -> None:
         beds, minutes, rate_hz = 10, 10, 50
-        recorder = self.record(flush_s=2.0)
+        recorder = self.record(self.FLUSH_S)
         publisher = self.start(
-            *("replay", "--connect", self.endpoint, "--beds", str(beds), "--bed", "icu", "--speed", "15"),
-            *("--seconds", str(60 * minutes), "--rate-hz", str(rate_hz), "--block-s", "0.2", *settings()),
+            *("replay", "--connect", self.endpoint, "--beds", str(beds), "--bed", "icu", "--speed", self.SPEED),
+            *("--seconds", str(60 * minutes), "--rate-hz", str(rate_hz), "--block-s", self.BLOCK_S),
+            *("--truth-hz", "1", *settings()),
         )
         publisher.wait(3 * PATIENCE_S)
         self.wait_for("estimates", beds * (60 * minutes - 1) * self.RATE_HZ)

@@ -29,7 +29,7 @@ pub(crate) struct Replay {
     record: Option<PathBuf>,
     /// Play back what `hemostream record` wrote here: all beds, with the times between messages that they arrived with
     #[arg(long, value_name = "DIR",
-          conflicts_with_all = ["record", "beds", "rate_hz", "block_s", "stagger_s", "start_s"])]
+          conflicts_with_all = ["record", "beds", "rate_hz", "truth_hz", "block_s", "stagger_s", "start_s"])]
     recording: Option<PathBuf>,
     /// Name of the bed [default: bed1]; several beds are called NAME-1, NAME-2, ... Of a recording: a bed to play, may
     /// be repeated
@@ -44,6 +44,9 @@ pub(crate) struct Replay {
     /// Samples per second of a synthetic patient
     #[arg(long, default_value_t = 200.0, value_parser = positive)]
     rate_hz: f64,
+    /// How often per second the truth of a synthetic patient is published, which dashboards draw; 0 is never
+    #[arg(long, default_value_t = 50.0, value_parser = not_negative)]
+    truth_hz: f64,
     /// Stop after so many patient-seconds
     #[arg(long, value_parser = positive)]
     seconds: Option<f64>,
@@ -122,13 +125,13 @@ impl Replay {
         let mut beds = self.make_beds(config)?;
         let options = ReplayOptions {
             rate_hz: self.rate_hz,
+            truth_rate_hz: self.truth_hz,
             speed: self.speed,
             seconds: self.seconds,
             block_s: self.block_s,
             stagger_s: self.stagger_s,
             start_s: self.start_s,
             repeat: self.repeat,
-            ..ReplayOptions::default()
         };
         let Connected { bus, stop, to, _runtime } = self.connect(config)?;
         say(format!("publishing {} bed(s) under {}/ to {}", self.beds, config.publish.prefix, to));
