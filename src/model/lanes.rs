@@ -15,20 +15,6 @@ pub const WIDTH: usize = 8;
 #[repr(align(64))]
 pub struct Lanes(pub [f64; WIDTH]);
 
-/// The same for every lane. Written out: kernels would hold thousands of loops, and unrolling them is what the compiler
-/// would spend most of a build on.
-macro_rules! lanes {
-    ($lane:ident => $value:expr) => {
-        lanes!($lane => $value; 0 1 2 3 4 5 6 7)
-    };
-    ($lane:ident => $value:expr; $($index:literal)+) => {
-        Lanes([$({
-            let $lane: usize = $index;
-            $value
-        }),+])
-    };
-}
-
 // All of these are a few instructions, and have to end up in the function that was compiled for the instruction set.
 #[allow(clippy::inline_always)]
 impl Lanes {
@@ -237,6 +223,8 @@ impl Lanes {
     }
 }
 
+// Written out: kernels would hold thousands of loops, and unrolling them is what the compiler would spend most of a build
+// on. What chooses stays a loop: there it finds better vector instructions.
 macro_rules! arithmetic {
     ($($trait:ident $function:ident $operator:tt),+) => {
         $(
@@ -244,8 +232,18 @@ macro_rules! arithmetic {
             impl $trait for Lanes {
                 type Output = Self;
                 #[inline(always)]
-                fn $function(self, other: Self) -> Self {
-                    lanes!(l => self.0[l] $operator other.0[l])
+                fn $function(self, Self(b): Self) -> Self {
+                    let Self(a) = self;
+                    Self([
+                        a[0] $operator b[0],
+                        a[1] $operator b[1],
+                        a[2] $operator b[2],
+                        a[3] $operator b[3],
+                        a[4] $operator b[4],
+                        a[5] $operator b[5],
+                        a[6] $operator b[6],
+                        a[7] $operator b[7],
+                    ])
                 }
             }
         )+
