@@ -148,6 +148,7 @@ class Process:
         """Ends it as a crash would."""
         self._child.kill()
         self._child.wait()
+        self._close()
 
     def stop(self) -> int:
         """Asks it to end, and returns its exit code."""
@@ -157,10 +158,14 @@ class Process:
                 self._child.wait(STOP_S)
             except subprocess.TimeoutExpired:
                 self.kill()
+        self._close()
+        return int(self._child.returncode)
+
+    def _close(self) -> None:
+        """Reads what it printed last."""
         self._reader.join(STOP_S)
         assert self._child.stdout is not None
         self._child.stdout.close()
-        return int(self._child.returncode)
 
 
 ADDRESS = r"http://127\.0\.0\.1:\d+"
