@@ -365,6 +365,12 @@ class LongRecording(RecordingCase):
             # None is missing and none is there twice; the last block may reach beyond the end.
             self.assertEqual(set(np.diff(times)), {1_000_000_000 // rate_hz}, f"{bed} {channel}")
             self.assertGreaterEqual(len(times), 60 * minutes * rate_hz, f"{bed} {channel}")
+        # One a second, as asked; what the network drops of it nobody gives again.
+        truths = pd.read_parquet(self.recording / "truth").groupby("bed", observed=True)
+        self.assertEqual(truths.ngroups, beds)
+        for bed, rows in truths:
+            self.assertGreaterEqual(np.diff(np.sort(rows["time_ns"].to_numpy())).min(), 1_000_000_000, bed)
+            self.assertGreater(len(rows), 60 * minutes / 2, bed)
         pattern = self.recording / "estimates" / "**" / "*.parquet"
         query = "select bed, count(distinct time_ns), (max(time_ns) - min(time_ns)) / 1e9, avg(p_a_q95 - p_a_q05) from "
         query += f"read_parquet('{pattern}', hive_partitioning = true) group by bed"
