@@ -22,6 +22,9 @@ const MAX_SLEEP: Duration = Duration::from_millis(50);
 /// How often to look for a listener.
 const LISTENER_LOOKS: u32 = 100;
 
+/// Longest wait for a daemon to take the end.
+const TAKEN_WITHIN: Duration = Duration::from_secs(5);
+
 /// What cannot be replayed.
 #[derive(Debug, thiserror::Error)]
 pub enum ReplayError {
@@ -286,6 +289,14 @@ pub fn wait_for_listener_at(bus: &dyn Bus, key: &str, stop: &AtomicBool) -> bool
     false
 }
 
+/// Waits until a daemon has taken what was sent to it, for a few seconds at most: what is still on its way when a session is
+/// closed is lost. It answers questions, whatever under, after the samples and events before them, which come first.
+pub(super) fn wait_until_taken(bus: &dyn Bus, key: &str) {
+    if let Err(error) = bus.last_values(key, TAKEN_WITHIN) {
+        tracing::debug!(%error, "nobody says whether the end has arrived");
+    }
+}
+
 /// Publishes all beds side by side until they end or `stop` is set; returns the patient-seconds published.
 ///
 /// # Errors
@@ -329,6 +340,9 @@ pub fn run(
             bed.sequences.fill(0);
         }
         sent_ns[next] = until;
+    }
+    if let Some(bed) = beds.first() {
+        wait_until_taken(bus, &format!("{}/{}/status", config.publish.prefix, bed.name));
     }
     Ok(s_from_ns(sent_ns.into_iter().max().unwrap_or(0)))
 }

@@ -13,7 +13,7 @@ use super::tables::Table;
 use crate::edge::bus::{Bus, Delivery, Encoding, Message};
 use crate::edge::files::columnar::{Batch, Kind, Reader};
 use crate::edge::files::error::FileError;
-use crate::edge::replay::{ReplayError, wait_until};
+use crate::edge::replay::{ReplayError, wait_until, wait_until_taken};
 use crate::edge::wire::{self, Acknowledge, Beats, Note, PressureBlock, SCHEMA, Truth};
 use crate::estimate::time::s_from_ns;
 use crate::runtime::clock::Clock;
@@ -270,6 +270,7 @@ pub fn play(
     progress: &mut dyn FnMut(Played),
 ) -> Result<Played, ReplayError> {
     let clock = Clock::start();
+    let asked = playback.first_key().map(str::to_owned);
     let (mut played, mut first) = (Played::default(), None);
     while let Some((arrival, message)) = playback.next_message()? {
         let since = s_from_ns(arrival.saturating_sub(*first.get_or_insert(arrival)));
@@ -284,6 +285,9 @@ pub fn play(
         bus.publish(message, if is_block { Delivery::Samples } else { Delivery::Events })?;
         played = Played { messages: played.messages + 1, seconds: since.max(played.seconds) };
         progress(played);
+    }
+    if let Some(key) = asked {
+        wait_until_taken(bus, &key);
     }
     Ok(played)
 }
