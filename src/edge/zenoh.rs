@@ -19,14 +19,25 @@ use super::config::{ZenohMode, ZenohSettings};
 /// Requests for last values that may wait; more are not answered.
 const MAX_WAITING_QUERIES: usize = 256;
 
-/// Publishers kept declared; more keys than this are published without.
+/// Keys whose publishers are kept declared; more than this are published without.
 const MAX_PUBLISHERS: usize = 16_384;
+
+/// Publishers of a key: what congestion does to a message is a matter of its publisher, so that there is one for each
+/// [`Delivery`] in use.
+#[derive(Default)]
+struct Publishers([Option<Arc<Publisher<'static>>>; 3]);
+
+impl Publishers {
+    fn of(&mut self, delivery: Delivery) -> &mut Option<Arc<Publisher<'static>>> {
+        &mut self.0[delivery as usize]
+    }
+}
 
 /// A zenoh session as a bus.
 #[derive(Clone)]
 pub struct ZenohBus {
     session: zenoh::Session,
-    publishers: Arc<Mutex<HashMap<String, Arc<Publisher<'static>>>>>,
+    publishers: Arc<Mutex<HashMap<String, Publishers>>>,
 }
 
 fn transport(error: impl std::fmt::Display) -> BusError {
@@ -83,8 +94,8 @@ impl ZenohBus {
 
     fn publisher(&self, key: &str, delivery: Delivery) -> Result<Arc<Publisher<'static>>, BusError> {
         let mut publishers = self.publishers.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(publisher) = publishers.get(key) {
-            return Ok(Arc::clone(publisher));
+        if let Some(publisher) = publishers.get_mut(key).and_then(|known| known.of(delivery).clone()) {
+            return Ok(publisher);
         }
         check_key(key)?;
         let (congestion, priority) = match delivery {
@@ -101,10 +112,19 @@ impl ZenohBus {
             .wait()
             .map_err(transport)?;
         let publisher = Arc::new(publisher);
-        if publishers.len() < MAX_PUBLISHERS {
-            publishers.insert(key.to_owned(), Arc::clone(&publisher));
+        if publishers.len() < MAX_PUBLISHERS || publishers.contains_key(key) {
+            *publishers.entry(key.to_owned()).or_default().of(delivery) = Some(Arc::clone(&publisher));
         }
         Ok(publisher)
+    }
+
+    /// Any publisher of a key.
+    fn some_publisher(&self, key: &str) -> Result<Arc<Publisher<'static>>, BusError> {
+        let declared = {
+            let publishers = self.publishers.lock().unwrap_or_else(PoisonError::into_inner);
+            publishers.get(key).and_then(|known| known.0.iter().flatten().next().cloned())
+        };
+        declared.map_or_else(|| self.publisher(key, Delivery::Estimates), Ok)
     }
 }
 
@@ -137,7 +157,7 @@ impl Bus for ZenohBus {
     }
 
     fn is_wanted(&self, key: &str) -> bool {
-        let publisher = self.publisher(key, Delivery::Estimates);
+        let publisher = self.some_publisher(key);
         publisher.is_ok_and(|p| p.matching_status().wait().is_ok_and(|status| status.matching()))
     }
 
@@ -195,5 +215,32 @@ impl Bus for ZenohBus {
             }
         }
         Ok(messages)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn being_asked_whether_a_message_is_wanted_does_not_change_how_it_is_delivered() {
+        let settings = ZenohSettings { mode: ZenohMode::Peer, listen: Vec::new(), connect: Vec::new() };
+        let bus = ZenohBus::open(&settings).unwrap();
+        let (heard, samples) = sync_channel(3);
+        let hear = move |sample: Sample| {
+            let _ = heard.send((sample.congestion_control(), sample.express()));
+        };
+        let _subscriber = bus.session.declare_subscriber("ward/**").callback(hear).wait().unwrap();
+        for (delivery, expected) in [
+            (Delivery::Estimates, (CongestionControl::Drop, false)),
+            (Delivery::Events, (CongestionControl::Block, false)),
+            (Delivery::Samples, (CongestionControl::Drop, true)),
+        ] {
+            let key = "ward/bed1/event".to_owned();
+            assert!(bus.is_wanted(&key));
+            bus.publish(Message { key, encoding: Encoding::Json, payload: b"{}".to_vec() }, delivery).unwrap();
+            assert_eq!(samples.recv_timeout(Duration::from_secs(5)).unwrap(), expected, "{delivery:?}");
+        }
+        bus.close();
     }
 }
