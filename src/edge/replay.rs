@@ -207,14 +207,21 @@ impl Bed {
         }
     }
 
-    /// Sends the waiting rows as one block per observed state.
-    fn flush(&mut self, bus: &dyn Bus, config: &Config, last: bool) -> Result<(), ReplayError> {
+    /// Sends the waiting rows from before `until` as one block per observed state; all that are left if this is the
+    /// `last` time.
+    fn flush(&mut self, bus: &dyn Bus, config: &Config, until: EventTime, last: bool) -> Result<(), ReplayError> {
+        let is_due = |time: EventTime| last || time < until;
+        let n_rows = self.waiting.iter().take_while(|(time, _)| is_due(*time)).count();
+        let rows: Vec<_> = self.waiting.drain(..n_rows).collect();
+        let n_truths = self.truths.iter().take_while(|(time, _)| is_due(*time)).count();
+        if n_rows + n_truths == 0 && !last {
+            return Ok(());
+        }
         for (state, name) in Pressures::NAMES.iter().enumerate() {
             if !config.observed.iter().any(|o| o == name) {
                 continue;
             }
-            let samples: Vec<(i64, f64)> =
-                self.waiting.iter().filter_map(|(t, row)| row[state].map(|v| (t.0, v))).collect();
+            let samples: Vec<(i64, f64)> = rows.iter().filter_map(|(t, row)| row[state].map(|v| (t.0, v))).collect();
             if samples.is_empty() && !(last && self.sequences[state] > 0) {
                 continue;
             }
@@ -233,11 +240,10 @@ impl Bed {
             let message = Message { key, encoding: Encoding::Bincode, payload: wire::encode(&block)? };
             bus.publish(message, Delivery::Samples)?;
         }
-        self.waiting.clear();
         let key = format!("{}/{}/truth", config.publish.prefix, self.name);
         let twin = format!("{key}/json");
         let (wanted, twin_wanted) = (bus.is_wanted(&key), config.publish.json && bus.is_wanted(&twin));
-        for (time, values) in self.truths.drain(..) {
+        for (time, values) in self.truths.drain(..n_truths) {
             if !(wanted || twin_wanted) {
                 continue;
             }
@@ -333,9 +339,7 @@ pub fn run(
         }
         bed.done = !more;
         wait_until(&clock, s_from_ns(due_ns(next, sent_ns[next])) / options.speed, stop);
-        if !bed.waiting.is_empty() || bed.done {
-            bed.flush(bus, config, bed.done)?;
-        }
+        bed.flush(bus, config, EventTime(origin.unwrap_or(0).saturating_add(until)), bed.done)?;
         if bed.done {
             bed.sequences.fill(0);
         }
@@ -354,5 +358,36 @@ pub(super) fn wait_until(clock: &Clock, seconds: f64, stop: &AtomicBool) {
             return;
         }
         std::thread::sleep(Duration::from_secs_f64(left).min(MAX_SLEEP));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::{Arc, Mutex};
+
+    use super::*;
+    use crate::edge::bus::MemoryBus;
+
+    #[test]
+    fn rows_further_apart_than_blocks_keep_their_pace() {
+        let config = Config::default();
+        let bus = MemoryBus::new();
+        let blocks = Arc::new(Mutex::new(Vec::new()));
+        let heard = Arc::clone(&blocks);
+        let hear = move |message: Message| {
+            let block: PressureBlock = wire::decode(&message.payload, message.encoding).unwrap();
+            heard.lock().unwrap().push(block);
+        };
+        let channel = &config.observed[0];
+        let _heard = bus.subscribe(&format!("*/bed1/pressure/{channel}"), Arc::new(hear)).unwrap();
+        let mut beds = [Bed::new("bed1", Source::synthetic(&config, 1).unwrap())];
+        let options = ReplayOptions { rate_hz: 40.0, speed: 1000.0, seconds: Some(2.0), ..ReplayOptions::default() };
+        let seconds = run(&bus, &config, &options, &mut beds, &AtomicBool::new(false)).unwrap();
+        // Sent at the end of the block that a row is in: blocks of 10 ms, most of which are empty.
+        assert!((2.0..2.02).contains(&seconds), "{seconds} s for rows from 0 to 2 s");
+        let blocks = blocks.lock().unwrap();
+        let times: Vec<i64> = blocks.iter().flat_map(|b| b.offsets_ns.iter().map(|o| b.start_ns + o)).collect();
+        assert_eq!(times, (0..=80).map(|k| k * 25_000_000).collect::<Vec<_>>());
+        assert!(blocks.iter().all(|block| block.values.len() <= 1), "one at a time");
     }
 }
