@@ -35,7 +35,7 @@ impl Acknowledge {
         let settings = client_settings(&config, &self.connect);
         let bus = runtime.block_on(async { ZenohBus::open(&settings) })?;
         let operator = Operator { bus: &bus, prefix: &config.publish.prefix, bed: &self.bed };
-        let acknowledged = operator.acknowledge(self.alarm.as_deref(), &self.author);
+        let acknowledged = operator.acknowledge(self.alarm.as_slice(), &self.author);
         bus.close();
         let acknowledged = acknowledged?;
         for alarm in &acknowledged {

@@ -107,32 +107,34 @@ impl Operator<'_> {
         Ok((time, heard))
     }
 
-    /// Acknowledges an alarm of the bed, or all of them; returns those that nobody had seen before.
+    /// Acknowledges alarms of the bed by their names, or without names all that wait now; returns those that nobody had seen
+    /// before. One that is raised meanwhile stays unseen: each is acknowledged by its name.
     ///
     /// # Errors
     /// When the bed or the alarm is not known, the bus fails, or the daemon does not confirm it.
-    pub fn acknowledge(&self, alarm: Option<&str>, author: &str) -> Result<Vec<Alarm>, OperatorError> {
+    pub fn acknowledge(&self, names: &[String], author: &str) -> Result<Vec<Alarm>, OperatorError> {
         self.check()?;
         check_length("author", author, 0..=MAX_AUTHOR)?;
         let Some(alarms) = self.alarms()? else {
             self.newest_time()?;
             return Err(OperatorError::NoAlarms(self.bed.to_owned()));
         };
-        if let Some(name) = alarm.filter(|name| !alarms.iter().any(|alarm| alarm.name == *name)) {
+        if let Some(found) = names.iter().find(|name| !alarms.iter().any(|alarm| alarm.name == **name)) {
             let known = alarms.iter().map(|alarm| alarm.name.clone()).collect();
-            return Err(OperatorError::UnknownAlarm { found: name.to_owned(), known });
+            return Err(OperatorError::UnknownAlarm { found: found.clone(), known });
         }
         let waits = |a: &Alarm| {
             let unseen = (a.state == "active" && !a.acknowledged) || a.state == "latched";
-            unseen && alarm.is_none_or(|name| name == a.name)
+            unseen && (names.is_empty() || names.contains(&a.name))
         };
         let unseen: Vec<Alarm> = alarms.into_iter().filter(&waits).collect();
         if unseen.is_empty() {
             return Ok(unseen);
         }
-        let name = alarm.unwrap_or_default().to_owned();
-        let message = Acknowledge { schema: SCHEMA, alarm: name, author: author.to_owned() };
-        self.bus.publish(self.message("acknowledge", wire::encode(&message)?), Delivery::Events)?;
+        for alarm in &unseen {
+            let message = Acknowledge { schema: SCHEMA, alarm: alarm.name.clone(), author: author.to_owned() };
+            self.bus.publish(self.message("acknowledge", wire::encode(&message)?), Delivery::Events)?;
+        }
         // One that is raised anew meanwhile is another one.
         let still = |now: &[Alarm]| {
             now.iter().filter(|a| waits(a)).any(|a| unseen.iter().any(|b| a.name == b.name && a.since_ns == b.since_ns))

@@ -215,6 +215,14 @@ impl Outlet {
         self.send(key, &message, Delivery::Events);
     }
 
+    /// Event time of the newest estimate of a bed.
+    fn newest_time(&self, bed: &str) -> EventTime {
+        let last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+        let state = last.get(&self.key(bed, "estimate/state"));
+        let state = state.and_then(|payload| wire::decode::<StateEstimate>(payload, Encoding::Bincode).ok());
+        state.map_or(EventTime(0), |state| EventTime(state.header.time_ns))
+    }
+
     fn status(&self, bed: &Bed, health: &Health) {
         let key = self.key(&bed.name, "status");
         let header = self.header(&key, health.time);
@@ -248,6 +256,11 @@ impl Sink for Outlet {
         }
         if let Some(health) = health {
             self.status(bed, health);
+            // Said on every change, and again with every status: whoever was away, or lost a message, does not go on with
+            // what was.
+            if let Some(now) = bed.estimator().alarms() {
+                self.alarms(bed, &now);
+            }
         }
     }
 
@@ -256,10 +269,16 @@ impl Sink for Outlet {
         self.bus.is_wanted(&key) || (self.json && self.bus.is_wanted(&format!("{key}/json")))
     }
 
+    fn gone(&self, bed: &str) {
+        let below = self.key(bed, "");
+        self.last.lock().unwrap_or_else(PoisonError::into_inner).retain(|key, _| !key.starts_with(&below));
+        self.sequences.lock().unwrap_or_else(PoisonError::into_inner).retain(|key, _| !key.starts_with(&below));
+    }
+
     fn lost(&self, bed: &str) {
         tracing::error!(bed, "the bed was lost to a defect in the program and starts anew");
         let key = self.key(bed, "event");
-        let header = self.header(&key, EventTime(0));
+        let header = self.header(&key, self.newest_time(bed));
         let text = "lost to a defect in the program; starts anew".to_owned();
         self.send(key, &Event { header, kind: "lost".to_owned(), channel: String::new(), text }, Delivery::Events);
     }

@@ -18,7 +18,7 @@
 //! | `estimate/members` | [`Members`] | only while someone subscribes |
 //! | `status` | [`Status`] | |
 //! | `event` | [`Event`] | |
-//! | `alarm` | [`Alarms`] | all alarms of the bed, whenever one of them changes |
+//! | `alarm` | [`Alarms`] | all alarms of the bed, whenever one of them changes, and with every status |
 //!
 //! Each `out` key has a twin `KEY/json`. The JSON holds the same content, arranged by name (`names` keeps the order);
 //! numbers that JSON cannot hold (NaN, infinities) are `null`. The arrays are described in the types.

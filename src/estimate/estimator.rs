@@ -83,6 +83,8 @@ pub struct Estimator<M: Model> {
     refused: BTreeMap<Refusal, u64>,
     restarts: u64,
     last_observation: Option<EventTime>,
+    /// Start of the first window since it last began.
+    began: EventTime,
     /// End of the last window that said something about each estimated parameter.
     informed: Vec<EventTime>,
     /// When each estimated parameter last began to move, or the start.
@@ -132,6 +134,7 @@ impl<M: Model> Estimator<M> {
             refused: BTreeMap::new(),
             restarts: 0,
             last_observation: None,
+            began: EventTime(0),
             informed: Vec::new(),
             calm_since: Vec::new(),
             want_members: false,
@@ -194,6 +197,12 @@ impl<M: Model> Estimator<M> {
             }
         };
         self.tallies.iter().enumerate().map(health).collect()
+    }
+
+    /// How the alarms stand; None where there are none.
+    pub fn alarms(&self) -> Option<AlarmsNow> {
+        let alarms = self.alarms.reports();
+        (!alarms.is_empty()).then(|| AlarmsNow { time: self.time(), alarms })
     }
 
     /// Takes one input at arrival time `now` and appends what follows from it.
@@ -367,6 +376,7 @@ impl<M: Model> Estimator<M> {
     fn solve(&mut self, window: &ClosedWindow, parallel: &dyn Parallel, out: &mut Vec<Output>) {
         let first = self.ensemble.is_none();
         if first {
+            self.began = window.start;
             let start_s = window.start.as_s();
             let mut ensemble = self.drawn.0.starting_at(start_s);
             ensemble.follow_beats(window.start);
@@ -517,7 +527,7 @@ impl<M: Model> Estimator<M> {
         while let Some((time, quantities, parameters)) = ensemble.smoothed(until) {
             out.push(Output::Smoothed(Estimate {
                 time,
-                since_data_ns: self.last_observation.map_or(0, |last| time.ns_since(last).max(0)),
+                since_data_ns: time.ns_since(self.last_observation.unwrap_or(self.began)).max(0),
                 members: ensemble.len(),
                 quantities,
                 parameters: parameters
@@ -584,7 +594,8 @@ impl<M: Model> Estimator<M> {
     ) -> Estimate {
         let s = position(window, time);
         let within = observations.iter().map(|o| observed_at(window, o)).filter(|t| *t <= time).max();
-        let last_data = within.or(self.last_observation);
+        // Before anything is learnt, there have been no data since the beginning.
+        let last_data = within.or(self.last_observation).unwrap_or(self.began);
         let Some(ensemble) = &self.ensemble else {
             return Estimate {
                 time,
@@ -598,7 +609,7 @@ impl<M: Model> Estimator<M> {
         let parameters = ensemble.summarise_parameters().into_iter().zip(&self.informed);
         Estimate {
             time,
-            since_data_ns: last_data.map_or(0, |last| time.ns_since(last).max(0)),
+            since_data_ns: time.ns_since(last_data).max(0),
             members: ensemble.len(),
             quantities: ensemble.summarise_at(s, &mut self.scratch.snapshot, parallel),
             parameters: parameters.map(|(p, at)| (p, time.ns_since(*at).max(0))).collect(),

@@ -358,6 +358,16 @@ fn beats_that_are_told_set_the_clock() {
 }
 
 #[test]
+fn without_a_beat_nothing_is_learnt_and_every_estimate_says_so() {
+    let mut bed = Bedside::new(&["estimator.timing=beats"], &[]);
+    bed.run(2.0, |_, _| {});
+    assert!(bed.estimates.len() > 90);
+    for estimate in &bed.estimates {
+        assert_eq!(estimate.since_data_ns, estimate.time.0, "a forecast since the first window, at 0 s");
+    }
+}
+
+#[test]
 fn a_look_back_knows_more() {
     let mut bed = Bedside::new(&["estimator.smoothing_lag_s=0.8"], &[]);
     bed.run(5.0, |_, _| {});

@@ -14,8 +14,8 @@ pub(super) const QUEUE: usize = 8;
 /// Something to tell the daemon.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Errand {
-    /// An alarm was seen, or without a name all of the bed.
-    Acknowledge { bed: String, alarm: Option<String> },
+    /// These alarms were seen; those raised meanwhile were not.
+    Acknowledge { bed: String, alarms: Vec<String> },
     /// Something about a bed at an event time, or now.
     Note { bed: String, time: Option<EventTime>, text: String },
 }
@@ -37,8 +37,7 @@ impl Errand {
     /// What is under way.
     pub(super) fn announcement(&self) -> String {
         match self {
-            Self::Acknowledge { bed, alarm: Some(alarm) } => format!("acknowledging in {bed}: {alarm} ..."),
-            Self::Acknowledge { bed, alarm: None } => format!("acknowledging all alarms of {bed} ..."),
+            Self::Acknowledge { bed, alarms } => format!("acknowledging in {bed}: {} ...", alarms.join(", ")),
             Self::Note { bed, .. } => format!("sending a note about {bed} ..."),
         }
     }
@@ -53,8 +52,8 @@ impl Errand {
 
     fn tell(&self, bus: &dyn Bus, prefix: &str, author: &str) -> Result<String, OperatorError> {
         match self {
-            Self::Acknowledge { bed, alarm } => {
-                let seen = Operator { bus, prefix, bed }.acknowledge(alarm.as_deref(), author)?;
+            Self::Acknowledge { bed, alarms } => {
+                let seen = Operator { bus, prefix, bed }.acknowledge(alarms, author)?;
                 let names: Vec<&str> = seen.iter().map(|alarm| alarm.name.as_str()).collect();
                 Ok(match names.join(", ") {
                     names if names.is_empty() => format!("nothing sent: no alarm of {bed} waits any more"),

@@ -76,7 +76,8 @@ impl Prompt {
                 Reply::Errand(Errand::Note { bed: bed.clone(), time: Some(*time), text: text.trim().to_owned() })
             }
             Self::Acknowledge { bed, alarms, at } => {
-                Reply::Errand(Errand::Acknowledge { bed: bed.clone(), alarm: alarms.get(*at).cloned() })
+                let chosen = alarms.get(*at).map_or_else(|| alarms.clone(), |alarm| vec![alarm.clone()]);
+                Reply::Errand(Errand::Acknowledge { bed: bed.clone(), alarms: chosen })
             }
             Self::Filter(_) | Self::Note { .. } => Reply::Closed { is_withdrawn: false },
         }
@@ -139,16 +140,16 @@ mod tests {
                 press(&mut prompt, *code);
             }
             match press(&mut prompt, KeyCode::Enter) {
-                Reply::Errand(Errand::Acknowledge { alarm, .. }) => alarm,
+                Reply::Errand(Errand::Acknowledge { alarms, .. }) => alarms,
                 other => panic!("{other:?}"),
             }
         };
         let both = ["low", "high"];
-        assert_eq!(chosen(&both, &[]).as_deref(), Some("low"));
-        assert_eq!(chosen(&both, &[KeyCode::Down]).as_deref(), Some("high"));
-        assert_eq!(chosen(&both, &[KeyCode::Up]), None);
-        assert_eq!(chosen(&both, &[KeyCode::Char('A')]), None);
-        assert_eq!(chosen(&both, &[KeyCode::Tab; 3]).as_deref(), Some("low"));
-        assert_eq!(chosen(&["low"], &[KeyCode::Tab]).as_deref(), Some("low"));
+        assert_eq!(chosen(&both, &[]), ["low"]);
+        assert_eq!(chosen(&both, &[KeyCode::Down]), ["high"]);
+        assert_eq!(chosen(&both, &[KeyCode::Up]), both);
+        assert_eq!(chosen(&both, &[KeyCode::Char('A')]), both);
+        assert_eq!(chosen(&both, &[KeyCode::Tab; 3]), ["low"]);
+        assert_eq!(chosen(&["low"], &[KeyCode::Tab]), ["low"]);
     }
 }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
+use axum::body::Bytes;
 use axum::extract::ws::{Message as Frame, WebSocket};
 use serde::Deserialize;
 use tokio::time::{Interval, MissedTickBehavior, interval, timeout};
@@ -20,6 +21,10 @@ const FRAME: Duration = Duration::from_millis(50);
 const TICKS_PER_REST: u64 = 10;
 /// A page that takes nothing for so long is let go; it connects again by itself.
 const PATIENCE: Duration = Duration::from_secs(30);
+/// A page is asked for a sign of life this often, and let go if it has given none for so long: a hidden one gets no frames
+/// that would tell.
+const ASK_EVERY: Duration = Duration::from_secs(20);
+const SILENT_FOR: Duration = Duration::from_secs(60);
 /// Closest points of a waveform, and the furthest apart \[ms\].
 const SPACING_MS: (f64, f64) = (4.0, 1000.0);
 
@@ -31,7 +36,7 @@ struct Request {
     bed: String,
     quantities: Vec<String>,
     spacing_ms: f64,
-    acknowledge: Option<String>,
+    acknowledge: Option<Vec<String>>,
     note: Option<String>,
     author: String,
     time_ns: Option<String>,
@@ -46,23 +51,30 @@ enum Shown {
 
 /// Serves a page until it goes.
 pub(super) async fn serve(mut socket: WebSocket, hub: Arc<Hub>) {
-    hub.pages.fetch_add(1, Ordering::Relaxed);
+    let _open = OpenPage::new(&hub);
     let mut shown = Shown::Ward { reset: true };
     let mut orders = Orders::new();
-    let mut pace = paced();
+    let (mut pace, mut asking) = (paced(FRAME), paced(ASK_EVERY));
+    let mut heard = hub.now();
     let mut ticks = 0_u64;
     loop {
         tokio::select! {
             received = socket.recv() => match received {
                 Some(Ok(Frame::Text(text))) => {
+                    heard = hub.now();
                     let refusal = obey(&text, &hub, &mut shown, &mut ticks, &orders);
                     if let Some(text) = refusal && !sent(&mut socket, Frame::Text(text.into())).await {
                         break;
                     }
                 }
                 Some(Ok(Frame::Close(_)) | Err(_)) | None => break,
-                Some(Ok(_)) => {}
+                Some(Ok(_)) => heard = hub.now(),
             },
+            _ = asking.tick() => {
+                if hub.now().saturating_sub(heard) > SILENT_FOR || !sent(&mut socket, Frame::Ping(Bytes::new())).await {
+                    break;
+                }
+            }
             Some(answer) = orders.next() => {
                 if !sent(&mut socket, Frame::Text(answer.into())).await {
                     break;
@@ -77,11 +89,26 @@ pub(super) async fn serve(mut socket: WebSocket, hub: Arc<Hub>) {
             }
         }
     }
-    hub.pages.fetch_sub(1, Ordering::Relaxed);
 }
 
-fn paced() -> Interval {
-    let mut pace = interval(FRAME);
+/// A page counts as long as this is there.
+struct OpenPage<'a>(&'a Hub);
+
+impl<'a> OpenPage<'a> {
+    fn new(hub: &'a Hub) -> Self {
+        hub.pages.fetch_add(1, Ordering::Relaxed);
+        Self(hub)
+    }
+}
+
+impl Drop for OpenPage<'_> {
+    fn drop(&mut self) {
+        self.0.pages.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
+fn paced(period: Duration) -> Interval {
+    let mut pace = interval(period);
     pace.set_missed_tick_behavior(MissedTickBehavior::Skip);
     pace
 }
@@ -140,9 +167,8 @@ impl Request {
 
     fn order(self) -> Option<Order> {
         let Self { bed, author, acknowledge, note, time_ns, .. } = self;
-        if let Some(alarm) = acknowledge {
-            let alarm = Some(alarm).filter(|name| !name.is_empty());
-            return Some(Order { word: "acknowledge", errand: Errand::Acknowledge { bed, alarm }, author });
+        if let Some(alarms) = acknowledge {
+            return Some(Order { word: "acknowledge", errand: Errand::Acknowledge { bed, alarms }, author });
         }
         let time = time_ns.and_then(|ns| ns.parse().ok()).map(EventTime);
         Some(Order { word: "note", errand: Errand::Note { bed, time, text: note? }, author })

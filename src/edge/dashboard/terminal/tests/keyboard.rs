@@ -28,21 +28,22 @@ fn an_alarm_is_acknowledged_by_two_keys() {
         alarm("seen", "high", "active", true),
     ];
     ward.apply(&alarms("bed1", all), 10 * SECOND);
-    let errand = |alarm: Option<&str>| {
-        Next::Tell(Errand::Acknowledge { bed: "bed1".to_owned(), alarm: alarm.map(str::to_owned) })
+    let errand = |alarms: &[&str]| {
+        let alarms = alarms.iter().map(|alarm| (*alarm).to_owned()).collect();
+        Next::Tell(Errand::Acknowledge { bed: "bed1".to_owned(), alarms })
     };
     let mut ui = Ui::new(None);
     press(&mut ui, &ward, KeyCode::Char('a'));
     assert_shows(&last_line(&ward, &ui), &["acknowledge in bed1 1/3", "major", "Enter sends, Esc"]);
-    assert_eq!(press(&mut ui, &ward, KeyCode::Enter), errand(Some("major")));
+    assert_eq!(press(&mut ui, &ward, KeyCode::Enter), errand(&["major"]));
     assert_shows(&last_line(&ward, &ui), &["acknowledging in bed1: major"]);
     press(&mut ui, &ward, KeyCode::Char('a'));
     press(&mut ui, &ward, KeyCode::Down);
-    assert_eq!(press(&mut ui, &ward, KeyCode::Enter), errand(Some("minor")));
+    assert_eq!(press(&mut ui, &ward, KeyCode::Enter), errand(&["minor"]));
     press(&mut ui, &ward, KeyCode::Char('a'));
     press(&mut ui, &ward, KeyCode::Char('A'));
     assert_shows(&last_line(&ward, &ui), &["all 2"]);
-    assert_eq!(press(&mut ui, &ward, KeyCode::Enter), errand(None));
+    assert_eq!(press(&mut ui, &ward, KeyCode::Enter), errand(&["major", "minor"]));
     press(&mut ui, &ward, KeyCode::Char('a'));
     assert_eq!(press(&mut ui, &ward, KeyCode::Esc), Next::Continue);
     assert_shows(&last_line(&ward, &ui), &["? help"]);
@@ -151,7 +152,7 @@ fn errands_are_run_in_order_and_what_became_of_them_is_said() {
     let _listens = bus.subscribe("ward/*/note", handler).unwrap();
     let (sender, errands) = sync_channel(errand::QUEUE);
     let (outcome_sender, outcomes) = sync_channel(errand::QUEUE);
-    let acknowledge = |bed: &str| Errand::Acknowledge { bed: bed.to_owned(), alarm: Some("a".to_owned()) };
+    let acknowledge = |bed: &str| Errand::Acknowledge { bed: bed.to_owned(), alarms: vec!["a".to_owned()] };
     let note = Errand::Note { bed: "bed1".to_owned(), time: Some(EventTime(3000 * MS)), text: "bolus".to_owned() };
     for errand in [acknowledge("bed1"), acknowledge("bed1"), note, acknowledge("bed9")] {
         sender.send(errand).unwrap();

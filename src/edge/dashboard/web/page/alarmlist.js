@@ -9,13 +9,15 @@ import { clockText, secondsOf } from "./time.js";
 const SHOWN_LIMIT = 50;
 
 export class AlarmList {
-  /** `onAcknowledge(name)` is called with the name of an alarm, `""` for all, and says whether that went out. */
+  /** `onAcknowledge(names)` is called with the names of alarms and says whether that went out. */
   constructor({ onAcknowledge }) {
     this.list = byId("alarm-list");
     this.all = byId("acknowledge-all");
     this.onAcknowledge = onAcknowledge;
     this.shown = null;
-    this.all.addEventListener("click", () => this.#acknowledge(""));
+    // All that are listed: what is raised meanwhile nobody has seen.
+    this.unseen = [];
+    this.all.addEventListener("click", () => this.#acknowledge(this.unseen));
   }
 
   /** Says how an acknowledgement ended: the list itself shows one that the daemon has taken. */
@@ -23,8 +25,15 @@ export class AlarmList {
     setText(byId("alarm-answer"), ok ? "" : text);
   }
 
-  #acknowledge(name) {
-    setText(byId("alarm-answer"), this.onAcknowledge(name) ? "" : "Not sent: the connection is lost.");
+  /** Puts the keyboard on the button of the most urgent alarm that nobody has seen, or says that there is none. */
+  focus() {
+    const button = this.list.querySelector("button");
+    if (button) button.focus();
+    else setText(byId("alarm-answer"), "No alarm to acknowledge.");
+  }
+
+  #acknowledge(names) {
+    setText(byId("alarm-answer"), this.onAcknowledge(names) ? "" : "Not sent: the connection is lost.");
   }
 
   /** Shows the alarms, and beside those that are raised what is now, from `bandNow(quantity)`. A list that did not change
@@ -40,7 +49,8 @@ export class AlarmList {
     const focused = this.list.contains(document.activeElement) ? document.activeElement.dataset.alarm : null;
     this.list.replaceChildren(...[...raised, ...others].slice(0, SHOWN_LIMIT).map((alarm) => this.#item(alarm)));
     if (focused !== null) [...this.list.querySelectorAll("button")].find((b) => b.dataset.alarm === focused)?.focus();
-    setHidden(this.all, !raised.some((alarm) => !alarm.acknowledged));
+    this.unseen = raised.filter((alarm) => !alarm.acknowledged).map((alarm) => alarm.name);
+    setHidden(this.all, this.unseen.length === 0);
     setHidden(byId("no-alarms"), alarms.length > 0);
     this.#writeNow();
     this.#announce(raised);
@@ -49,7 +59,7 @@ export class AlarmList {
   #writeNow() {
     for (const node of this.list.querySelectorAll(".alarm-now")) {
       const band = this.bandNow(node.dataset.quantity);
-      const digits = band ? decimals(band.mean, (band.high - band.low) / 2) : 0;
+      const digits = band ? decimals(band.mean, (band.q95 - band.q05) / 2) : 0;
       setText(node, band ? `now ${number(band.mean, digits)}` : "");
     }
   }
@@ -78,16 +88,16 @@ export class AlarmList {
   #button(name) {
     const attributes = { type: "button", "data-alarm": name, "aria-label": `Acknowledge ${name}`, text: "Acknowledge" };
     const button = element("button", attributes);
-    button.addEventListener("click", () => this.#acknowledge(name));
+    button.addEventListener("click", () => this.#acknowledge([name]));
     return button;
   }
 }
 
 function detail(alarm) {
-  const digits = decimals(alarm.mean, (alarm.high - alarm.low) / 2);
+  const digits = decimals(alarm.mean, (alarm.q95 - alarm.q05) / 2);
   const limit = `${labelOf(alarm.quantity)} ${alarm.side === "below" ? "<" : ">"} ${alarm.limit} ${alarm.unit}`;
   // The band is of the moment when the alarm became what it is; what it is by now stands beside.
-  const band = alarm.mean == null ? "" : `: ${number(alarm.mean, digits)} (${range(alarm.low, alarm.high, digits)})`;
+  const band = alarm.mean == null ? "" : `: ${number(alarm.mean, digits)} (${range(alarm.q05, alarm.q95, digits)})`;
   const since = alarm.state === "latched" ? "off since" : "since";
   const when = isRaised(alarm) ? `, ${since} ${clockText(secondsOf(alarm.since_ns))}` : "";
   return `${limit}${when}${band}`;

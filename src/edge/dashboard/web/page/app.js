@@ -135,6 +135,7 @@ const commands = [
   { names: ["←", "→"], keys: ["ArrowLeft", "ArrowRight"], text: "back and forth in time", ...inBed, run: stepInTime },
   { names: ["l", "End"], keys: ["l", "End"], text: "back to live", ...inBed, run: () => bed.viewport.live() },
   { names: ["1 … 5"], keys: [...SPAN_KEYS], text: `show ${SPANS_S.join(", ")} s`, ...inBed, run: chooseSpan },
+  { names: ["a"], keys: ["a"], text: "to the alarm to acknowledge (Enter does it)", ...inBed, run: () => bed.alarms.focus() },
   { names: ["n"], keys: ["n"], text: "write a note", ...inBed, run: () => byId("note-text").focus() },
   { names: ["t"], keys: ["t"], text: "light, dark, as the system", ...anywhere, run: () => byId("theme").click() },
   { names: ["?"], keys: ["?"], text: "these keys", ...anywhere, run: showKeys },

@@ -49,7 +49,7 @@ export class Bed {
     this.charts = new Charts();
     this.trends = new Trends(this.charts, () => this.#scene());
     addLoops(this.charts, () => this.#scene());
-    this.alarms = new AlarmList({ onAcknowledge: (alarm) => send({ acknowledge: alarm, bed: this.name }) });
+    this.alarms = new AlarmList({ onAcknowledge: (alarms) => send({ acknowledge: alarms, bed: this.name }) });
     this.events = new EventLog({ onNote: (text, author) => this.#note(text, author) });
     this.viewport.onChange(() => this.#redraw());
     this.writes = 0;

@@ -4,7 +4,7 @@ import { element } from "./dom.js";
 import { color } from "./theme.js";
 import { clockText, nsOf } from "./time.js";
 
-const BAND = [["mean", "mean"], ["low", "q05"], ["high", "q95"]];
+const BAND = ["mean", "q05", "q95"];
 
 /** Offers `blob` as a file. */
 export function save(blob, name) {
@@ -25,7 +25,7 @@ export function fileName(bed, time, ending) {
 export function stripsCsv(history, viewport, names) {
   const samples = names.filter((name) => history.samples.has(name));
   const truths = names.filter((name) => history.truth.column(name) && history.truth.length);
-  const header = ["time_ns", "since_data_s", ...names.flatMap((n) => BAND.map(([, q]) => `${n}_${q}`)),
+  const header = ["time_ns", "since_data_s", ...names.flatMap((n) => BAND.map((part) => `${n}_${part}`)),
     ...samples.map((n) => `${n}_sample`), ...truths.map((n) => `${n}_truth`)];
   const place = new Map(header.map((name, k) => [name, k]));
   const rows = [];
@@ -36,7 +36,7 @@ export function stripsCsv(history, viewport, names) {
     }
   };
   const { estimate, truth } = history;
-  const bands = names.flatMap((n) => BAND.map(([part, q]) => [`${n}_${q}`, estimate.column(`${n}.${part}`)]));
+  const bands = names.flatMap((n) => BAND.map((part) => [`${n}_${part}`, estimate.column(`${n}.${part}`)]));
   collect(estimate, [["since_data_s", estimate.column("since_data")], ...bands].filter(([, column]) => column));
   for (const name of samples) collect(history.samples.get(name), [[`${name}_sample`, history.samples.get(name).column("value")]]);
   collect(truth, truths.map((name) => [`${name}_truth`, truth.column(name)]));
