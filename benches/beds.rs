@@ -158,7 +158,12 @@ fn service(criterion: &mut Criterion) {
     for beds in BEDS {
         group.throughput(Throughput::Elements(beds as u64));
         let sink = Arc::new(Counter::default());
-        let limits = Limits { max_beds: beds, queue_tasks: 4096, report_every: Duration::from_secs(3600) };
+        let limits = Limits {
+            max_beds: beds,
+            forget_after: Duration::MAX,
+            queue_tasks: 4096,
+            report_every: Duration::from_secs(3600),
+        };
         let (workers, said) = (Arc::new(Workers::start(0).unwrap()), Arc::clone(&sink));
         let _inside = runtime.enter();
         let (service, inlet) =

@@ -18,6 +18,9 @@ use hemostream::runtime::workers::Workers;
 use super::dashboard::bind;
 use super::{ConfigArgs, Failure, LOG, failed, log_to_stderr, say};
 
+/// A bed that has had no samples for so long makes room for a new one where there are as many as there may be.
+const FORGET_AFTER: Duration = Duration::from_secs(3600);
+
 /// Run the daemon: estimate every bed whose pressures arrive
 #[derive(Args)]
 #[command(after_help = "Example:  hemostream serve --config config/default.toml\n\nBeds appear with their first \
@@ -44,6 +47,7 @@ impl Running {
         let sink = Arc::new(Outlet::start(Arc::clone(&bus), config)?);
         let limits = Limits {
             max_beds: config.service.max_beds,
+            forget_after: FORGET_AFTER,
             queue_tasks: config.service.queue_blocks,
             report_every: Duration::from_secs_f64(1.0 / config.publish.status_rate_hz),
         };
@@ -53,6 +57,11 @@ impl Running {
         let task = tokio::spawn(service.run());
         let listening = inlet::listen(bus.as_ref(), config, inlet.clone(), recent)?;
         Ok(Self { inlet, task, _listening: listening })
+    }
+
+    /// Waits until the service ends by itself, which only a defect in the program can make it do.
+    async fn ended(&mut self) {
+        let _ = (&mut self.task).await;
     }
 
     /// Finishes what is waiting and stops.
@@ -134,7 +143,7 @@ impl Serve {
         log_to_stderr(LOG)?;
         tokio_runtime()?.block_on(async {
             let bus = ZenohBus::open(&config.zenoh)?;
-            let running = Running::start(Arc::new(bus.clone()), &config)?;
+            let mut running = Running::start(Arc::new(bus.clone()), &config)?;
             let metrics = match &self.metrics {
                 Some(address) => Some(observe(address, &config, &bus).await?),
                 None => None,
@@ -145,8 +154,12 @@ impl Serve {
                 config.zenoh.listen.iter().chain(&config.zenoh.connect).cloned().collect::<Vec<_>>().join(", "),
                 config.hash(),
             ));
-            asked_to_stop().await;
-            running.stop().await;
+            tokio::select! {
+                () = asked_to_stop() => running.stop().await,
+                () = running.ended() => {
+                    return Err(Failure::Failed("the service ended by itself: a defect in the program".to_owned()));
+                }
+            }
             if let Some(metrics) = metrics {
                 metrics.stop().await;
             }

@@ -58,6 +58,9 @@ pub trait Sink: Send + Sync {
 
     /// A bed was lost and starts anew.
     fn lost(&self, bed: &str);
+
+    /// A bed was let go; what is remembered of it can be forgotten.
+    fn gone(&self, _bed: &str) {}
 }
 
 /// Limits of the service.
@@ -65,6 +68,8 @@ pub trait Sink: Send + Sync {
 pub struct Limits {
     /// Beds kept; messages of others are counted and dropped.
     pub max_beds: usize,
+    /// A bed that has had no samples for so long makes room for a new one where there are as many as there may be.
+    pub forget_after: Duration,
     /// Tasks waiting per bed.
     pub queue_tasks: usize,
     /// Time between reports.
@@ -107,8 +112,17 @@ struct Slot {
     queue_full: u64,
     /// When it last had something to do.
     touched: ArrivalTime,
+    /// When something last came in for it.
+    heard: ArrivalTime,
     /// Share of the members that it was told to go on with.
     share: f64,
+}
+
+impl Slot {
+    fn account(&self, account: &mut Account) {
+        account.lost = account.lost.saturating_add(self.queue_full);
+        self.bed.iter().for_each(|bed| bed.account(account));
+    }
 }
 
 /// The service.
@@ -134,6 +148,10 @@ pub struct Service {
     /// When the last new bed appeared.
     newest: Option<ArrivalTime>,
     too_many_beds: u64,
+    /// Messages of unknown beds that nobody understood.
+    not_understood: u64,
+    /// What beds did that were let go.
+    gone: Account,
     /// Events that did not fit into the queue, counted by the inlet.
     dropped: Arc<AtomicU64>,
 }
@@ -173,6 +191,8 @@ impl Service {
             looked: (clock.now(), 0),
             newest: None,
             too_many_beds: 0,
+            not_understood: 0,
+            gone: Account::default(),
             dropped: Arc::clone(&inlet.dropped),
         };
         Ok((service, inlet))
@@ -209,11 +229,9 @@ impl Service {
                 else => break,
             }
         }
-        let mut account = Account { lost: self.dropped.load(Ordering::Relaxed), ..Account::default() };
-        for slot in self.beds.values() {
-            account.lost = account.lost.saturating_add(slot.queue_full);
-            slot.bed.iter().for_each(|bed| bed.account(&mut account));
-        }
+        let mut account = std::mem::take(&mut self.gone);
+        account.lost = account.lost.saturating_add(self.dropped.load(Ordering::Relaxed));
+        self.beds.values().for_each(|slot| slot.account(&mut account));
         account
     }
 
@@ -242,6 +260,7 @@ impl Service {
                 let bed = self.new_bed(&name);
                 if let Some(slot) = self.beds.get_mut(&name) {
                     slot.bed = Some(bed);
+                    slot.queue_full = slot.queue_full.saturating_add(slot.waiting.len() as u64);
                     slot.waiting.clear();
                     slot.share = 1.0;
                 }
@@ -261,7 +280,11 @@ impl Service {
         if !self.beds.contains_key(name) {
             // What nobody understands makes no bed.
             if let Task::Refused(cause) = task {
-                tracing::warn!(bed = name, cause, "a message for an unknown bed was not understood");
+                self.not_understood += 1;
+                if self.not_understood.is_power_of_two() {
+                    let so_far = self.not_understood;
+                    tracing::warn!(bed = name, cause, so_far, "a message for an unknown bed was not understood");
+                }
                 return;
             }
             // A bed appears with its first sample; before that there is nothing to have seen.
@@ -269,7 +292,7 @@ impl Service {
                 tracing::warn!(bed = name, "an alarm of an unknown bed was acknowledged");
                 return;
             }
-            if self.beds.len() >= self.limits.max_beds {
+            if self.beds.len() >= self.limits.max_beds && !self.make_room(now) {
                 self.too_many_beds += 1;
                 if self.too_many_beds.is_power_of_two() {
                     tracing::warn!(bed = name, max_beds = self.limits.max_beds, "bed refused: too many beds");
@@ -278,12 +301,16 @@ impl Service {
             }
             let bed = self.new_bed(name);
             tracing::info!(bed = name, "new bed");
-            let slot = Slot { bed: Some(bed), waiting: VecDeque::new(), queue_full: 0, touched: now, share: 1.0 };
+            let slot =
+                Slot { bed: Some(bed), waiting: VecDeque::new(), queue_full: 0, touched: now, heard: now, share: 1.0 };
             self.beds.insert(name.to_owned(), slot);
             self.newest = Some(now);
         }
         let limit = self.limits.queue_tasks;
         if let Some(slot) = self.beds.get_mut(name) {
+            if matches!(task, Task::Samples { .. } | Task::Beats(_)) {
+                slot.heard = now;
+            }
             if slot.waiting.len() >= limit {
                 slot.queue_full += 1;
             } else {
@@ -296,6 +323,20 @@ impl Service {
         } else {
             self.dispatch();
         }
+    }
+
+    /// Lets the bed go that has been silent longest, if that is long enough; whether one went.
+    fn make_room(&mut self, now: ArrivalTime) -> bool {
+        let silence_ns = i64::try_from(self.limits.forget_after.as_nanos()).unwrap_or(i64::MAX);
+        let is_forgotten = |slot: &Slot| slot.bed.is_some() && now.ns_since(slot.heard) >= silence_ns;
+        let silent = self.beds.iter().filter(|(_, slot)| is_forgotten(slot));
+        let Some(name) = silent.min_by_key(|(_, slot)| slot.heard).map(|(name, _)| name.clone()) else { return false };
+        if let Some(slot) = self.beds.remove(&name) {
+            slot.account(&mut self.gone);
+        }
+        self.sink.gone(&name);
+        tracing::info!(bed = name, "let go: silent for long, and there is a new bed");
+        true
     }
 
     /// Hands beds to the workers, those first whose samples have waited longest: all windows have the same time to be

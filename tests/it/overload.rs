@@ -79,7 +79,8 @@ async fn overload_is_said_in_every_estimate_and_ends() {
     let sets = ["estimator.members=40", "window.length_s=0.005", "observed=[\"p_a\"]"].map(str::to_owned);
     let config = Config::load_from(None, [], &sets).unwrap().0;
     let sink = Arc::new(Slow { is_slow: AtomicBool::new(true), said: Mutex::default() });
-    let limits = Limits { max_beds: 4, queue_tasks: 256, report_every: Duration::from_secs(60) };
+    let limits =
+        Limits { max_beds: 4, forget_after: Duration::MAX, queue_tasks: 256, report_every: Duration::from_secs(60) };
     let workers = Arc::new(Workers::start(1).unwrap());
     let settings = config.estimator_settings().unwrap();
     let said = Arc::clone(&sink);

@@ -169,8 +169,36 @@ fn what_is_not_understood_is_counted_and_names_cannot_break_a_table() {
     recorder.take(message("bed0", "elsewhere", &1_u8), START).unwrap();
     recorder.take(Message { key: "other/bed0/truth".to_owned(), ..bad[0].clone() }, START).unwrap();
     let summary = recorder.close().unwrap();
-    assert_eq!(summary.refused, BTreeMap::from([("malformed", 6), ("too_many_beds", 2), ("unknown_topic", 1)]));
+    let causes = [("malformed", 5), ("too_many_beds", 2), ("unknown_topic", 1), ("wrong_schema", 1)];
+    assert_eq!(summary.refused, BTreeMap::from(causes));
     assert_eq!(summary.rows, BTreeMap::from([("truth", 4)]));
+}
+
+fn one_truth() -> Truth {
+    Truth { schema: SCHEMA, time_ns: 0, names: vec!["x".to_owned()], values: vec![1.0] }
+}
+
+#[test]
+fn a_bed_that_is_silent_for_an_hour_makes_room_for_another() {
+    let directory = tempfile::tempdir().unwrap();
+    let mut recorder = open(directory.path(), START);
+    let take = |recorder: &mut Recorder, bed: &str, s: i64| {
+        recorder.take(message(bed, "truth", &one_truth()), START + s * S).unwrap();
+        recorder.flush_due(START + (s + 4) * S).unwrap();
+    };
+    for bed in ["a", "b", "c", "d", "e"] {
+        take(&mut recorder, bed, 0);
+    }
+    take(&mut recorder, "b", 1800);
+    take(&mut recorder, "e", 3590);
+    // All but one have been silent by now.
+    take(&mut recorder, "b", 3610);
+    for bed in ["e", "f", "g", "h"] {
+        take(&mut recorder, bed, 3620);
+    }
+    let summary = recorder.close().unwrap();
+    assert_eq!(summary.refused, BTreeMap::from([("too_many_beds", 3)]));
+    assert_eq!((summary.beds, summary.rows["truth"]), (7, 9));
 }
 
 #[test]
@@ -320,6 +348,36 @@ fn nothing_is_lost_or_doubled_by_an_interruption() {
 }
 
 #[test]
+fn older_hours_are_tidied_beside_the_recording_and_those_to_come_are_left_alone() {
+    let directory = tempfile::tempdir().unwrap();
+    // The last first, so that none finds what another left.
+    let hours = [1, 0, -1, -30].map(|hour| START + hour * 3600 * S);
+    let folders = hours.map(|ns| layout::folder(directory.path(), "truth", "icu", &layout::hour(ns)));
+    for (ns, folder) in hours.into_iter().zip(&folders) {
+        let mut recorder = open(directory.path(), ns);
+        for s in [0, 4] {
+            recorder.take(message("icu", "truth", &one_truth()), ns + s * S).unwrap();
+            recorder.flush_due(ns + (s + 4) * S).unwrap();
+        }
+        drop(recorder);
+        std::fs::write(folder.join(".part-000007.parquet.tmp"), "half").unwrap();
+    }
+    let names = |folder: &PathBuf| {
+        let entries = std::fs::read_dir(folder).unwrap();
+        let mut names: Vec<String> = entries.map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    };
+    let (parts, merged) = (["part-000000.parquet", "part-000001.parquet"], ["part-000000-000001.parquet"]);
+    let recorder = open(directory.path(), START);
+    assert_eq!(names(&folders[1]), parts, "what was unfinished is gone at once");
+    drop(recorder);
+    assert_eq!(names(&folders[1]), parts);
+    assert_eq!([&folders[2], &folders[3]].map(names), [merged, merged]);
+    assert_eq!(names(&folders[0])[0], ".part-000007.parquet.tmp", "somebody may be writing it by then");
+}
+
+#[test]
 fn two_recorders_do_not_share_a_directory_and_a_file_is_none() {
     let directory = tempfile::tempdir().unwrap();
     let one = open(directory.path(), START);
@@ -423,7 +481,8 @@ async fn recorded(directory: &Path, link: Link, publish: impl FnOnce(&MemoryBus)
     let recording = Recording::start(&bus, link, directory);
     let workers = Arc::new(Workers::start(2).unwrap());
     let outlet = Arc::new(Outlet::start(Arc::new(bus.clone()), &config).unwrap());
-    let limits = Limits { max_beds: 8, queue_tasks: 1 << 16, report_every: Duration::from_secs(1) };
+    let limits =
+        Limits { max_beds: 8, forget_after: Duration::MAX, queue_tasks: 1 << 16, report_every: Duration::from_secs(1) };
     let (model, settings) = (config.circulation().unwrap(), config.estimator_settings().unwrap());
     let sink = Arc::clone(&outlet);
     let (service, inlet) = Service::new(model, settings, limits, workers, sink, Clock::start()).unwrap();
@@ -534,6 +593,37 @@ async fn what_nobody_has_is_lost() {
     assert!(summary.lost > 2 * 30 && summary.recovered == 0, "{summary:?}");
 }
 
+/// Rows of two tables wait, and a file stands where the folder of one of them should be.
+fn half_broken(directory: &Path) -> Recorder {
+    let mut recorder = open(directory, START);
+    recorder.take(message("a", "pressure/p_a", &block(0, 0, &[1.0])), START).unwrap();
+    recorder.take(message("b", "truth", &one_truth()), START).unwrap();
+    recorder.flush_due(START + 3 * S / 2).unwrap();
+    std::fs::write(directory.join("samples"), "").unwrap();
+    recorder.take(message("c", "truth", &one_truth()), START + 2 * S).unwrap();
+    let error = recorder.flush_due(START + 5 * S / 2).unwrap_err().to_string();
+    assert!(error.contains("samples"), "{error}");
+    recorder
+}
+
+#[test]
+fn what_is_not_written_stays_and_what_else_there_is_gets_to_the_disk() {
+    let directory = tempfile::tempdir().unwrap();
+    let error = half_broken(directory.path()).close().unwrap_err().to_string();
+    assert!(error.contains("samples"), "{error}");
+    for bed in ["b", "c"] {
+        assert_eq!(rows(directory.path(), "truth", bed, &[]).len(), 1, "{bed}");
+    }
+
+    let directory = tempfile::tempdir().unwrap();
+    let recorder = half_broken(directory.path());
+    std::fs::remove_file(directory.path().join("samples")).unwrap();
+    recorder.close().unwrap();
+    for (table, bed) in [("samples", "a"), ("truth", "b"), ("truth", "c")] {
+        assert_eq!(rows(directory.path(), table, bed, &[]).len(), 1, "{table} of {bed}");
+    }
+}
+
 #[test]
 fn a_disk_that_does_not_take_it_ends_the_recording_with_what_is_wrong() {
     let directory = tempfile::tempdir().unwrap();
@@ -554,4 +644,25 @@ fn a_disk_that_does_not_take_it_ends_the_recording_with_what_is_wrong() {
     });
     let error = ended.unwrap_err().to_string();
     assert!(error.starts_with("recording: ") && error.contains("samples"), "{error}");
+}
+
+#[test]
+fn a_disk_that_does_not_take_all_of_it_gets_the_rest_before_the_recording_ends() {
+    let directory = tempfile::tempdir().unwrap();
+    let bus = MemoryBus::new();
+    let stop = AtomicBool::new(false);
+    let ended = std::thread::scope(|scope| {
+        let recording =
+            scope.spawn(|| recorder::run(&bus, directory.path(), options(), Units::default(), &stop, &mut |_, _| {}));
+        while !bus.is_wanted("hemostream/icu/alarm") && !recording.is_finished() {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        std::fs::write(directory.path().join("samples"), "").unwrap();
+        bus.publish(message("icu", "pressure/p_a", &block(0, 0, &[1.0])), Delivery::Samples).unwrap();
+        bus.publish(message("other", "truth", &one_truth()), Delivery::Samples).unwrap();
+        recording.join().unwrap()
+    });
+    let error = ended.unwrap_err().to_string();
+    assert!(error.contains("samples"), "{error}");
+    assert_eq!(rows(directory.path(), "truth", "other", &[]).len(), 1);
 }

@@ -68,6 +68,11 @@ impl Daemon {
 
     /// Hears these topics only.
     pub(crate) fn start_on(bus: MemoryBus, config: &Config, topics: &[&str]) -> Self {
+        Self::start_forgetting(bus, config, topics, Duration::MAX)
+    }
+
+    /// The same; a bed that has been silent for so long makes room where there is none.
+    fn start_forgetting(bus: MemoryBus, config: &Config, topics: &[&str], forget_after: Duration) -> Self {
         let said = Arc::new(Mutex::new(Vec::new()));
         let hear = |topic: &&str| {
             let hearing = Arc::clone(&said);
@@ -79,6 +84,7 @@ impl Daemon {
         let outlet = Arc::new(Outlet::start(Arc::new(bus.clone()), config).unwrap());
         let limits = Limits {
             max_beds: config.service.max_beds,
+            forget_after,
             queue_tasks: config.service.queue_blocks,
             report_every: Duration::from_secs_f64(1.0 / config.publish.status_rate_hz),
         };
@@ -571,6 +577,26 @@ async fn one_bed_more_than_allowed_is_refused() {
         assert_eq!(three.states(bed), two.states(bed));
         assert_eq!(three.counters(bed), BTreeMap::new());
     }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_bed_that_has_been_silent_for_long_makes_room() {
+    let bus = MemoryBus::new();
+    let config = config(&["service.max_beds=1"]);
+    let topics = ["estimate/state", "status", "event"];
+    let daemon = Daemon::start_forgetting(bus, &config, &topics, Duration::from_millis(300));
+    let time = |m: &Message| wire::decode::<StateEstimate>(&m.payload, Encoding::Bincode).unwrap().header.time_ns;
+    record("one", 8).into_iter().for_each(|m| daemon.send(m));
+    daemon.wait_for("hemostream/one/estimate/state", |m| time(m) == end_of_record(8) / (20 * MS) * 20 * MS).await;
+    // It has spoken just now.
+    record("two", 8).into_iter().for_each(|m| daemon.send(m));
+    tokio::time::sleep(Duration::from_millis(400)).await;
+    record("three", 8).into_iter().for_each(|m| daemon.send(m));
+    daemon.wait_for("hemostream/three/estimate/state", |_| true).await;
+    assert!(daemon.last("hemostream/one/**").is_none(), "what has gone is no news for late joiners");
+    let said = daemon.stop().await;
+    assert_eq!(said.beds(), ["one", "three"]);
+    assert_eq!([said.states("one").len(), said.states("three").len()], [20, 20]);
 }
 
 /// A subscriber that hangs until its gate is opened.
