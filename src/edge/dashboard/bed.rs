@@ -9,10 +9,11 @@ use crate::edge::wire::{
     Alarm, Alarms, BEAT_STATISTICS, BeatEstimate, ChannelStatus, Event, Header, Note, PARAMETER_STATISTICS,
     ParameterEstimate, PressureBlock, STATE_STATISTICS, StateEstimate, Status, Truth,
 };
-use crate::model::cvsim6::{FlowsAndVolumes, PARAMETERS, Pressures};
+use crate::model::Quantity;
+use crate::model::cvsim6::{DERIVED, PARAMETERS, Pressures, STATES};
 
 /// Pressures, flows and volumes.
-pub(super) const QUANTITIES: usize = Pressures::LEN + FlowsAndVolumes::LEN;
+pub(super) const QUANTITIES: usize = STATES.len() + DERIVED.len();
 /// Nothing for this long, and a bed is stale.
 pub(super) const STALE_AFTER: Duration = Duration::from_secs(2);
 /// An estimate this long without data is called a forecast \[s\].
@@ -123,7 +124,7 @@ pub(super) struct EventLine {
 pub(super) enum Origin {
     /// A sensor delivers it.
     Observed,
-    /// It has a sensor that does not deliver at present.
+    /// It has a sensor that delivers nothing of use at present.
     Silent,
     /// No sensor.
     Inferred,
@@ -179,9 +180,14 @@ pub(super) struct Bed {
     pub(super) status_arrival: Option<Duration>,
 }
 
-/// Names of the quantities in their order here.
+/// The quantities in their order here.
+pub(super) fn quantity_infos() -> impl Iterator<Item = &'static Quantity> {
+    STATES.iter().chain(DERIVED)
+}
+
+/// Their names.
 pub(super) fn quantity_names() -> impl Iterator<Item = &'static str> {
-    Pressures::NAMES.iter().chain(FlowsAndVolumes::NAMES).copied()
+    quantity_infos().map(|q| q.name)
 }
 
 /// Where a quantity stands in that order.
@@ -241,13 +247,24 @@ impl Bed {
                 }
             }
             let state_row = StateRow { bands, since_data_s };
+            let generation = self.history.restarts();
             self.history.push(time_ns, state_row.clone(), limits);
+            if self.history.restarts() != generation {
+                self.forget_beats();
+            }
             // The history thins out and forgets after a jump back: its end decides what is newest.
             if self.history.newest_ns().is_none_or(|newest| time_ns >= newest) {
                 self.state = Some((time_ns, state_row));
                 self.spread = spread(&columns, row);
             }
         }
+    }
+
+    /// Event time has begun anew: beats of another run are none of this one, and neither are trends.
+    fn forget_beats(&mut self) {
+        self.beat.1.clear();
+        self.beat_trends.clear();
+        self.parameters.iter_mut().for_each(|parameter| parameter.trend = History::default());
     }
 
     fn take_samples(&mut self, channel: usize, block: &PressureBlock, limits: Limits) {
@@ -260,6 +277,8 @@ impl Bed {
     }
 
     fn take_parameters(&mut self, estimate: &ParameterEstimate) {
+        // What is not estimated any more is not known any more.
+        self.parameters.retain(|p| estimate.names.iter().any(|name| tame(name, MAX_NAME) == p.name));
         let rows = estimate.values.chunks(PARAMETER_STATISTICS.len());
         for (name, row) in estimate.names.iter().zip(rows).take(MAX_PARAMETERS) {
             let name = tame(name, MAX_NAME);
@@ -463,16 +482,20 @@ impl Bed {
         let Some(samples) = self.samples.get(quantity) else { return Origin::Inferred };
         let listed =
             self.status.as_ref().and_then(|s| s.channels.iter().find(|c| self::quantity(&c.name) == Some(quantity)));
-        match listed.map(|c| c.state.as_str()) {
-            Some("live") => Origin::Observed,
+        match listed.map(|c| (c.state.as_str(), c.artefact.as_str())) {
+            Some(("live", "")) => Origin::Observed,
             Some(_) => Origin::Silent,
             None if self.status.is_some() || samples.newest_ns().is_none() => Origin::Inferred,
             None => Origin::Observed,
         }
     }
 
-    /// Beats per minute: estimated, or else that of the last beat, or counted on the left ventricle.
+    /// Beats per minute: estimated, or else that of the last beat, or counted on the left ventricle; None where beats have
+    /// been told and none comes any more.
     pub(super) fn heart_rate_bpm(&self) -> Option<f64> {
+        if self.has_beats() && !self.is_beating() {
+            return None;
+        }
         let estimated = self.parameters.iter().find(|p| p.name == "heart_rate").map(|p| p.mean);
         let of_beat = || self.of_beat("heart_rate").map(|reading| f64::from(reading.band.mean));
         estimated.or_else(of_beat).or_else(|| self.counted_beats_bpm())

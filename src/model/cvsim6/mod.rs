@@ -148,9 +148,11 @@ named_vector! {
     }
 }
 
-const STATES: &[Quantity] = &[mmhg("p_l"), mmhg("p_a"), mmhg("p_v"), mmhg("p_r"), mmhg("p_pa"), mmhg("p_pv")];
+/// The states: six pressures.
+pub const STATES: &[Quantity] = &[mmhg("p_l"), mmhg("p_a"), mmhg("p_v"), mmhg("p_r"), mmhg("p_pa"), mmhg("p_pv")];
 
-const DERIVED: &[Quantity] = &[
+/// What states and parameters give: six flows, six volumes.
+pub const DERIVED: &[Quantity] = &[
     flow("q_li"),
     flow("q_lo"),
     flow("q_a"),

@@ -184,15 +184,17 @@ fn pressure(bed: &Bed, name: &str, width: usize) -> String {
 
 fn alarm(bed: &Bed, width: usize) -> (String, Style) {
     let raised = urgency::raised(bed);
-    let Some(highest) = raised.first() else { return (String::new(), style::QUIET) };
-    let sign = urgency::sign(highest);
+    // One that nobody has seen is not hidden behind one that somebody has.
+    let unseen = raised.iter().find(|alarm| urgency::is_unseen(alarm));
+    let Some(shown) = unseen.or(raised.first()) else { return (String::new(), style::QUIET) };
+    let sign = urgency::sign(shown);
     if width < LONG_ALARM {
-        return (sign.to_owned(), urgency::look(highest));
+        return (sign.to_owned(), urgency::look(shown));
     }
     let others = if raised.len() > 1 { format!(" +{}", raised.len() - 1) } else { String::new() };
-    let seen = if urgency::is_unseen(highest) { "" } else { " seen" };
+    let seen = if urgency::is_unseen(shown) { "" } else { " seen" };
     let room = width.saturating_sub(sign.chars().count() + 1 + seen.len() + others.len());
-    (format!("{sign} {}{seen}{others}", style::fit(&highest.name, room)), urgency::look(highest))
+    (format!("{sign} {}{seen}{others}", style::fit(&shown.name, room)), urgency::look(shown))
 }
 
 fn state(bed: &Bed, now: Duration, width: usize) -> (String, Style) {

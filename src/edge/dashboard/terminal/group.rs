@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use super::super::bed::quantity_infos;
 use crate::model::cvsim6::Pressures;
 
 /// Quantities that are drawn together.
@@ -37,11 +38,7 @@ impl Group {
     }
 
     pub(super) fn unit(self) -> &'static str {
-        match self {
-            Self::Pressures => "mmHg",
-            Self::Flows => "mL/s",
-            Self::Volumes => "mL",
-        }
+        quantity_infos().nth(self.quantities().start).map_or("", |q| q.unit)
     }
 
     /// Shortest vertical axis: less than this is no movement worth filling the height with.

@@ -57,9 +57,10 @@ pub(super) fn of_bed(bed: &Bed) -> u8 {
 
 /// The bed with the most urgent raised alarm among those that are `wanted`.
 pub(super) fn most_urgent_bed(ward: &Ward, wanted: impl Fn(&str, &Alarm) -> bool) -> Option<(&str, &Alarm)> {
-    let beds = ward.beds.iter().filter_map(|(name, bed)| Some((name.as_str(), highest(bed)?)));
+    let alarms =
+        ward.beds.iter().flat_map(|(name, bed)| raised(bed).into_iter().map(move |alarm| (name.as_str(), alarm)));
     // Of equals the first.
-    beds.filter(|(name, alarm)| wanted(name, alarm)).min_by_key(|(_, alarm)| std::cmp::Reverse(urgency(alarm)))
+    alarms.filter(|(name, alarm)| wanted(name, alarm)).min_by_key(|(_, alarm)| std::cmp::Reverse(urgency(alarm)))
 }
 
 /// Shape and exclamation marks of a priority.

@@ -5,19 +5,11 @@ use std::time::Duration;
 use serde_json::{Map, Value, json};
 
 use super::super::bed::{
-    Band, BeatReading, Bed, FORECAST_AFTER_S, Liveness, Origin, Parameter, Quality, quantity_names,
+    Band, BeatReading, Bed, FORECAST_AFTER_S, Liveness, Origin, Parameter, Quality, quantity_infos,
 };
 use super::frame::time;
 use crate::edge::wire::{Alarm, Status};
-
-/// Unit of a pressure, flow or volume.
-pub(super) fn unit(quantity: &str) -> &'static str {
-    match quantity.as_bytes().first() {
-        Some(b'q') => "mL/s",
-        Some(b'v') => "mL",
-        _ => "mmHg",
-    }
-}
+use crate::model::Quantity;
 
 /// Whether what is said of a bed is the present, in a word.
 pub(super) fn liveness(bed: &Bed, now: Duration) -> &'static str {
@@ -50,7 +42,7 @@ pub(super) fn condition(name: &str, bed: &Bed, now: Duration) -> Map<String, Val
 }
 
 fn band(band: Band) -> Map<String, Value> {
-    let fields = [("mean", band.mean), ("low", band.low), ("high", band.high)];
+    let fields = [("mean", band.mean), ("q05", band.low), ("q95", band.high)];
     fields.into_iter().map(|(key, value)| (key.to_owned(), json!(value))).collect()
 }
 
@@ -67,10 +59,10 @@ pub(super) fn beat(readings: &[BeatReading]) -> Value {
 /// All quantities now: bands, spread by source, where they come from.
 pub(super) fn quantities(bed: &Bed) -> Vec<Value> {
     let Some((_, row)) = &bed.state else { return Vec::new() };
-    let entry = |(q, name): (usize, &'static str)| {
+    let entry = |(q, about): (usize, &Quantity)| {
         let mut fields = band(row.bands[q]);
-        fields.insert("name".to_owned(), json!(name));
-        fields.insert("unit".to_owned(), json!(unit(name)));
+        fields.insert("name".to_owned(), json!(about.name));
+        fields.insert("unit".to_owned(), json!(about.unit));
         let origin = match bed.origin(q) {
             Origin::Observed => "observed",
             Origin::Silent => "silent",
@@ -85,14 +77,14 @@ pub(super) fn quantities(bed: &Bed) -> Vec<Value> {
         }
         Value::Object(fields)
     };
-    quantity_names().enumerate().map(entry).collect()
+    quantity_infos().enumerate().map(entry).collect()
 }
 
 /// All parameters now.
 pub(super) fn parameters(bed: &Bed) -> Vec<Value> {
     let entry = |p: &Parameter| {
         json!({
-            "name": p.name, "unit": p.unit, "mean": p.mean, "low": p.low, "high": p.high,
+            "name": p.name, "unit": p.unit, "mean": p.mean, "q05": p.low, "q95": p.high,
             "since_informed_s": p.since_informed_s, "identifiable": p.is_identifiable,
             "truth": bed.true_parameters.get(p.name.as_str()),
         })
@@ -103,11 +95,11 @@ pub(super) fn parameters(bed: &Bed) -> Vec<Value> {
 /// All alarms.
 pub(super) fn alarms(bed: &Bed) -> Vec<Value> {
     let entry = |a: &Alarm| {
-        let [mean, low, high] = a.band;
+        let [mean, q05, q95] = a.band;
         json!({
             "name": a.name, "quantity": a.quantity, "unit": a.unit, "priority": a.priority, "state": a.state,
             "acknowledged": a.acknowledged, "side": a.side, "limit": a.limit, "since_ns": time(a.since_ns),
-            "mean": mean, "low": low, "high": high, "text": a.text,
+            "mean": mean, "q05": q05, "q95": q95, "text": a.text,
         })
     };
     bed.alarms.iter().map(entry).collect()

@@ -136,6 +136,11 @@ fn of_daemon(scrape: &mut Scrape<'_>, now: Duration) {
     scrape.gauges("bed_estimate_age", age, Some(Unit::Seconds), |bed| {
         bed.silence(now).map(|age| (Labels::new(), age.as_secs_f64())).into_iter().collect()
     });
+    let age = "Since the daemon last said how it does with the bed";
+    scrape.gauges("bed_status_age", age, Some(Unit::Seconds), |bed| {
+        let age = bed.status_arrival.map(|arrival| now.saturating_sub(arrival));
+        age.map(|age| (Labels::new(), age.as_secs_f64())).into_iter().collect()
+    });
     let solve = "Mean time to solve a window for all members, lately";
     scrape.gauges("bed_solve_time", solve, Some(Unit::Seconds), |bed| told(bed, |s| s.solve_ms * 1e-3));
     scrape.gauges("bed_members", "Members configured", None, |bed| told(bed, |s| f64::from(s.members)));

@@ -24,7 +24,7 @@ fn bed(name: &str, bed: &Bed, now: Duration) -> Map<String, Value> {
     fields.insert("since_data_s".to_owned(), json!(bed.state.as_ref().map(|(_, row)| row.since_data_s)));
     fields.insert("quantities".to_owned(), by_name(describe::quantities(bed)));
     fields.insert("parameters".to_owned(), by_name(describe::parameters(bed)));
-    fields.insert("beat".to_owned(), with_quantiles(describe::beat(bed.beat())));
+    fields.insert("beat".to_owned(), describe::beat(bed.beat()));
     fields.insert("alarms".to_owned(), json!(describe::alarms(bed)));
     fields.insert("health".to_owned(), describe::status(bed));
     fields
@@ -36,17 +36,5 @@ fn by_name(entries: Vec<Value>) -> Value {
         let name = entry.as_object_mut()?.remove("name")?;
         Some((name.as_str()?.to_owned(), entry))
     });
-    with_quantiles(Value::Object(named.collect()))
-}
-
-/// The edges of a band are called after what they are, as in all messages.
-fn with_quantiles(mut table: Value) -> Value {
-    for entry in table.as_object_mut().into_iter().flat_map(Map::values_mut).filter_map(Value::as_object_mut) {
-        for (short, long) in [("low", "q05"), ("high", "q95")] {
-            if let Some(value) = entry.remove(short) {
-                entry.insert(long.to_owned(), value);
-            }
-        }
-    }
-    table
+    Value::Object(named.collect())
 }

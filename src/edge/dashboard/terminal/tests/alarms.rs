@@ -55,6 +55,10 @@ fn an_alarm_of_another_bed_is_told_until_somebody_has_seen_it() {
     for size in SIZES {
         assert_shows(line(&screen(&ward, &ui, 10 * SECOND, size)), &["◆!! in bed2"]);
     }
+    // Behind one that somebody has seen as well.
+    let seen_first = vec![alarm("a", "medium", "active", false), alarm("b", "high", "active", true)];
+    ward.apply(&alarms("bed2", seen_first), 10 * SECOND);
+    assert_shows(line(&screen(&ward, &ui, 10 * SECOND, (120, 40))), &["◆!! in bed2"]);
     ward.apply(&alarms("bed2", vec![alarm("a", "medium", "active", true)]), 10 * SECOND);
     assert!(!screen(&ward, &ui, 10 * SECOND, (80, 24)).contains("in bed2"));
 }

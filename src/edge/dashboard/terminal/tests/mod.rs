@@ -279,6 +279,7 @@ fn a_channel_that_is_set_aside_and_one_that_the_model_does_not_fit_are_marked() 
     let mut health: Status = wire::decode(&status("bed1", 9500 * MS).payload, Encoding::Bincode).unwrap();
     health.channels[0].artefact = "flush".to_owned();
     ward.apply(&message("ward/bed1/status", &health), 10 * SECOND);
+    assert_eq!(ward.beds["bed1"].origin(1), Origin::Silent, "its samples are not what is shown");
     for size in SIZES {
         let shown = screen(&ward, &Ui::new(None), 10 * SECOND, size);
         assert_shows(&shown, &["flush"]);
@@ -288,6 +289,35 @@ fn a_channel_that_is_set_aside_and_one_that_the_model_does_not_fit_are_marked() 
     health.channels[0].misfit = true;
     ward.apply(&message("ward/bed1/status", &health), 10 * SECOND);
     assert_shows(&screen(&ward, &Ui::new(None), 10 * SECOND, (120, 40)), &["p_a  live", "misfit!"]);
+}
+
+#[test]
+fn a_heart_that_stands_still_has_no_rate_and_no_output() {
+    let mut ward = filled();
+    let estimate = ParameterEstimate {
+        header: header(0),
+        members: 100,
+        names: vec!["heart_rate".to_owned()],
+        values: vec![75.0, 0.5, 74.0, 76.0, 0.9, 0.1, 1.0],
+    };
+    ward.apply(&message("ward/bed1/estimate/parameters", &estimate), 10 * SECOND);
+    let shown = |ward: &Ward| screen(ward, &Ui::new(None), 14 * SECOND, (120, 40));
+    assert_shows(&shown(&ward), &["HR 75/min", "CO 5.12"]);
+    assert!(!shown(&ward).contains("r_pv"), "what is estimated no more is known no more");
+    // The last beat ended at 9.8 s.
+    ward.apply(&state("bed1", 13_900 * MS, 0.0), 14 * SECOND);
+    let still = shown(&ward);
+    assert!(!still.contains("HR 75") && !still.contains("CO 5.12"), "{still}");
+}
+
+#[test]
+fn beats_of_another_run_are_not_of_this_one() {
+    let mut ward = filled();
+    assert_eq!(ward.beds["bed1"].beat_trends.len(), BEAT.len());
+    ward.apply(&state("bed1", 1000 * MS, 0.0), 10 * SECOND);
+    let bed = &ward.beds["bed1"];
+    assert!(bed.beat().is_empty() && bed.beat_trends.is_empty() && !bed.has_beats());
+    assert!(bed.parameters.iter().all(|parameter| parameter.trend.len() == 0));
 }
 
 #[test]

@@ -16,6 +16,8 @@ export class Connection {
     this.waitMs = LEAST_WAIT_MS;
     this.wish = { show: "ward" };
     this.heardAt = performance.now();
+    /** Since when an answer is due. */
+    this.askedAt = this.heardAt;
     document.addEventListener("visibilitychange", () => this.#ask());
     setInterval(() => this.#watch(), 1000);
     this.#open();
@@ -40,11 +42,12 @@ export class Connection {
   }
 
   #ask() {
-    this.heardAt = performance.now();
+    this.askedAt = performance.now();
     this.send(document.hidden ? { show: "nothing" } : this.wish);
   }
 
   #open() {
+    this.askedAt = performance.now();
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     const socket = new WebSocket(`${scheme}://${location.host}/live`);
     socket.binaryType = "arraybuffer";
@@ -72,7 +75,8 @@ export class Connection {
   }
 
   #watch() {
-    if (document.hidden || !this.socket || this.silentFor() * 1000 < SILENCE_MS) return;
+    const silentMs = performance.now() - Math.max(this.heardAt, this.askedAt);
+    if (document.hidden || !this.socket || silentMs < SILENCE_MS) return;
     const socket = this.socket;
     socket.close();
     this.#lose(socket);

@@ -19,7 +19,9 @@ const JUMP_BACK_S = 1;
 /** Parts that strips are painted of. */
 const WAVEFORMS = ["estimate", "truth", "samples"];
 
-const BAND = ["mean", "low", "high"];
+/** A beat that ended longer ago is not the present one; the server thinks the same. */
+const PRESENT_BEAT_S = 4;
+const BAND = ["mean", "q05", "q95"];
 
 export class History {
   #changedFrom;
@@ -74,13 +76,14 @@ export class History {
     return this.estimate.oldest;
   }
 
-  /** Mean, low and high of a clinical quantity in the beat that was the last one at `time`; null if none is known. */
+  /** Mean and band of a clinical quantity in the beat that was the last one at `time`; null if none is known, or if it was
+   * long ago by then: what does not beat has no output. */
   beatAt(name, time) {
     const series = this.beats.get(name);
     const index = series ? series.at(time) : -1;
-    if (index < 0) return null;
+    if (index < 0 || time - series.times[index] > PRESENT_BEAT_S) return null;
     const value = (part) => series.column(part)[index];
-    return { mean: value("mean"), low: value("low"), high: value("high"), unit: this.units.get(name) ?? "" };
+    return { mean: value("mean"), q05: value("q05"), q95: value("q95"), unit: this.units.get(name) ?? "" };
   }
 
   // An answer to a new question repeats a part of the past that is known already; only where event time went back does
@@ -128,12 +131,12 @@ export class History {
         return [named(this.samples, part.channel, ["value"], SAMPLES_LIMIT), { value: rows[1] }];
       case "parameters": {
         this.units.set(part.name, part.unit);
-        const columns = { mean: rows[1], low: rows[2], high: rows[3], informed: rows[4], truth: rows[5] };
+        const columns = { mean: rows[1], q05: rows[2], q95: rows[3], informed: rows[4], truth: rows[5] };
         return [named(this.parameters, part.name, Object.keys(columns), TREND_LIMIT), columns];
       }
       default: {
         this.units.set(part.name, part.unit);
-        return [named(this.beats, part.name, BAND, TREND_LIMIT), { mean: rows[1], low: rows[2], high: rows[3] }];
+        return [named(this.beats, part.name, BAND, TREND_LIMIT), { mean: rows[1], q05: rows[2], q95: rows[3] }];
       }
     }
   }

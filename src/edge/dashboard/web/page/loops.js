@@ -35,7 +35,7 @@ export function addLoops(charts, scene) {
 // Points of the last beat before `right`: means and half widths of the bands. Its length is what the heart rate says.
 function lastBeat(history, right, { pressure, volume }) {
   const { estimate } = history;
-  const names = [pressure, volume].flatMap((name) => ["mean", "low", "high"].map((part) => `${name}.${part}`));
+  const names = [pressure, volume].flatMap((name) => ["mean", "q05", "q95"].map((part) => `${name}.${part}`));
   const columns = names.map((name) => estimate.column(name));
   if (columns.some((column) => !column)) return null;
   const rate = (history.beatAt("heart_rate", right) ?? history.latest.beat?.heart_rate)?.mean;

@@ -157,7 +157,7 @@ function paintEstimate(ctx, at, estimate, name, picture, paintBetween) {
   if (!estimate.column(`${name}.mean`)) return account;
   const stride = strideOf(rowsPerPixel(estimate, at));
   const [from, to] = visible(estimate, picture, stride);
-  const [mean, low, high] = ["mean", "low", "high"].map((part) => estimate.column(`${name}.${part}`));
+  const [mean, low, high] = ["mean", "q05", "q95"].map((part) => estimate.column(`${name}.${part}`));
   const runs = runsOf(estimate, name, from, to);
   for (const run of runs) paintBand(ctx, at, bandOf(estimate, low, high, run.from, run.to, stride), run.isForecast, picture.palette);
   account.samples = paintBetween();

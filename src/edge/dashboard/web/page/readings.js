@@ -22,9 +22,9 @@ function arranged(name, isKnown, bands) {
   if (!isKnown) return { main: NONE, side: "", band: NONE };
   const [systolic, diastolic, mean] = bands.map((of) => number(of?.mean, 0));
   // All three in the same way, or they would be hard to compare.
-  const asHalf = bands.some((of) => of && of.high - of.low < 1);
+  const asHalf = bands.some((of) => of && of.q95 - of.q05 < 1);
   const [ofSystolic, ofDiastolic, ofMean] = bands.map((of) =>
-    asHalf ? halfWidth(of?.low, of?.high) : range(of?.low, of?.high, 0),
+    asHalf ? halfWidth(of?.q05, of?.q95) : range(of?.q05, of?.q95, 0),
   );
   if (name === "p_v" || name === "p_pv") {
     return { main: mean, side: `(${systolic}/${diastolic})`, band: `${ofMean} (${ofSystolic} / ${ofDiastolic})` };
@@ -44,7 +44,7 @@ export function singleReading(name, at) {
     main: number(band?.mean, digits),
     side: "",
     // Where the band is narrower than the last digit shown it needs another one to be seen as a band.
-    band: band ? spread(band.low, band.high, band.high - band.low < 10 ** -digits ? digits + 1 : digits) : NONE,
+    band: band ? spread(band.q05, band.q95, band.q95 - band.q05 < 10 ** -digits ? digits + 1 : digits) : NONE,
     note: band && (name === "svr" || name === "pvr") ? woodUnits(band.mean) : "",
   };
 }

@@ -12,7 +12,7 @@ const TICKS = 4;
 
 /** Smallest and largest of the values to be shown of rows `[from, to)`; null if there is none. */
 export function extent(estimate, name, from, to) {
-  const [mean, low, high] = ["mean", "low", "high"].map((part) => estimate.column(`${name}.${part}`));
+  const [mean, low, high] = ["mean", "q05", "q95"].map((part) => estimate.column(`${name}.${part}`));
   let [least, most, lowest, highest] = [Infinity, -Infinity, Infinity, -Infinity];
   for (let i = from; i < to; i += 1) {
     if (mean[i] < least) least = mean[i];

@@ -96,7 +96,7 @@ export class Strip {
     const account = { ...this.#paint(history, viewport, -Infinity, options), left, right };
     const { estimate } = history;
     const newest = estimate.at(right);
-    for (const part of ["low", "high"]) account[part] = newest < 0 ? null : (estimate.column(`${this.name}.${part}`)?.[newest] ?? null);
+    for (const part of ["q05", "q95"]) account[part] = newest < 0 ? null : (estimate.column(`${this.name}.${part}`)?.[newest] ?? null);
     account.truthInside = options.showTruth ? shareInside(history, this.name, left, right) : null;
     return account;
   }
@@ -136,7 +136,7 @@ export class Strip {
     const mean = estimate.column(`${this.name}.mean`);
     const row = mean ? estimate.at(viewport.right) : -1;
     const at = (part) => (row < 0 ? null : estimate.column(`${this.name}.${part}`)[row]);
-    const [low, high] = [at("low"), at("high")];
+    const [low, high] = [at("q05"), at("q95")];
     const digits = this.isPressure ? 0 : Math.min(decimals(at("mean"), (high - low) / 2), 1);
     const instant = `${number(at("mean"), digits)}  ${spread(low, high, digits)} ${this.about.unit}`;
     setText(this.origin, Object.hasOwn(ORIGINS, origin) ? ORIGINS[origin] : "");

@@ -54,7 +54,7 @@ function points(series, rows, right, column) {
 function bandTraces(series, rows, right, hue, informed) {
   const [x, y] = [[], []];
   for (const stretch of stretches(rows)) {
-    const outline = [...stretch.map((i) => [i, "high"]), ...stretch.toReversed().map((i) => [i, "low"])];
+    const outline = [...stretch.map((i) => [i, "q95"]), ...stretch.toReversed().map((i) => [i, "q05"])];
     for (const [i, part] of outline) {
       x.push(series.times[i] - right);
       y.push(series.column(part)[i]);

@@ -79,9 +79,9 @@ class TrendCard {
     const series = this.seriesOf(history);
     const row = series ? series.at(viewport.right) : -1;
     const at = (part) => (row < 0 ? NaN : (series.column(part)?.[row] ?? NaN));
-    const digits = decimals(at("mean"), (at("high") - at("low")) / 2);
+    const digits = decimals(at("mean"), (at("q95") - at("q05")) / 2);
     setText(this.value, number(at("mean"), digits));
-    setText(this.band, row < 0 ? NONE : `${spread(at("low"), at("high"), digits)} ${history.units.get(this.name) ?? ""}`);
+    setText(this.band, row < 0 ? NONE : `${spread(at("q05"), at("q95"), digits)} ${history.units.get(this.name) ?? ""}`);
     setText(this.state, this.isParameter ? informedText(history, this.name, at("informed")) : "");
     setAttribute(this.node, "data-informed", String(!this.isParameter || at("informed") >= 0.5));
   }

@@ -7,7 +7,7 @@ import { longestSpacing } from "./runs.js";
 export function shareInside({ truth, estimate }, name, left, right) {
   const value = truth.column(name);
   const [from, to] = [truth.lower(left), truth.lower(right)];
-  const [low, high] = [estimate.column(`${name}.low`), estimate.column(`${name}.high`)];
+  const [low, high] = [estimate.column(`${name}.q05`), estimate.column(`${name}.q95`)];
   if (!value || !low || estimate.length < 2 || from >= to) return null;
   const { times } = estimate;
   const last = Math.min(estimate.lower(truth.times[to - 1]) + 1, estimate.end);

@@ -60,7 +60,7 @@ export class Ward {
     const rows = ["bed,liveness,age_s,quality,quantity,unit,mean,q05,q95"];
     for (const bed of this.head?.beds ?? []) {
       for (const [key, band] of Object.entries(bed.values ?? {})) {
-        const cells = [bed.bed, bed.liveness, bed.age_s, bed.quality, key, band.unit, band.mean, band.low, band.high];
+        const cells = [bed.bed, bed.liveness, bed.age_s, bed.quality, key, band.unit, band.mean, band.q05, band.q95];
         rows.push(cells.map(csvCell).join(","));
       }
     }
