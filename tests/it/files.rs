@@ -185,6 +185,80 @@ fn what_cannot_be_converted_is_refused_with_exit_code_2() {
 }
 
 #[test]
+fn files_of_samples_that_are_read_or_are_somebody_elses_are_not_written_over() {
+    let folder = Folder::new();
+    let csv = folder.write("a.csv", "time_s,p_a\n0,80\n0.01,81\n0.02,82\n");
+    done(&["convert", &csv, &folder.text("r")]);
+    done(&["convert", &csv, &folder.text("r.hea")]);
+    let samples = std::fs::read(folder.path("r.dat")).unwrap();
+    // The same record under another name, and in segments.
+    folder.write("other.hea", &std::fs::read_to_string(folder.path("r.hea")).unwrap());
+    folder.write("long.hea", "long/2 1 100 6\nr 3\nr 3\n");
+    let foreign = folder.write("s.dat", "not ours");
+    folder.write("t.dat", "not ours either");
+    folder.write("t.hea", "t 1 100 3\nr.dat 16\n");
+    let ours = folder.names();
+    for (input, output, complaint) in [
+        ("r", "r", "r: found the record that is read, expected another file to write to"),
+        ("other", "r", "r: found the record that is read"),
+        ("long.hea", "r.hea", "r.hea: found the record that is read"),
+        ("a.csv", "s", "s.dat: found a file of something else, expected no such file, or one that"),
+        ("a.csv", "t", "t.dat: found a file of something else"),
+    ] {
+        let (code, said) = refused(&["convert", &folder.text(input), &folder.text(output)]);
+        assert_eq!(code, Some(2), "{input} to {output}: {said}");
+        assert!(said.contains(complaint), "{input} to {output}: {said}");
+    }
+    assert_eq!(folder.names(), ours);
+    assert_eq!(std::fs::read(folder.path("r.dat")).unwrap(), samples);
+    assert_eq!(std::fs::read(foreign).unwrap(), b"not ours");
+}
+
+#[test]
+fn a_pressure_in_another_unit_is_ignored_and_said() {
+    let folder = Folder::new();
+    let csv = folder.write("a.csv", "time_s,p_a,p_pa\n0,80,20\n0.01,81,21\n");
+    done(&["convert", &csv, &folder.text("r"), "--label", "p_pa=PAP"]);
+    let header = std::fs::read_to_string(folder.path("r.hea")).unwrap();
+    // The last line is that of p_pa.
+    let (before, last) = header.rsplit_once("/mmHg").unwrap();
+    folder.write("r.hea", &format!("{before}/kPa{last}"));
+    let output = hemostream(&["convert", &folder.text("r"), &folder.text("b.csv")]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success(), "{said}");
+    assert!(said.contains("PAP: a signal of p_pa in kPa, expected mmHg, is ignored"), "{said}");
+    assert_eq!(std::fs::read_to_string(folder.path("b.csv")).unwrap(), "time_s,p_a\n0,80\n0.01,81\n");
+}
+
+#[test]
+fn csv_is_whole_or_not_there() {
+    let folder = Folder::new();
+    let csv = folder.write("a.csv", "time_s,p_a\n0,80\n1000,81\n");
+    let out = folder.write("b.csv", "what was there");
+    let (code, said) = refused(&["convert", &csv, &out, "--rate-hz", "1000000"]);
+    assert_eq!(code, Some(2), "{said}");
+    assert!(said.contains("places at 1000000 Hz"), "{said}");
+    assert_eq!((std::fs::read_to_string(&out).unwrap().as_str(), folder.names().len()), ("what was there", 2));
+    done(&["convert", &csv, &out]);
+    assert_eq!(std::fs::read_to_string(&out).unwrap(), "time_s,p_a\n0,80\n1000,81\n");
+    assert_eq!(folder.names(), ["a.csv", "b.csv"]);
+}
+
+#[cfg(unix)]
+#[test]
+fn csv_goes_through_a_pipe_with_a_name() {
+    let folder = Folder::new();
+    let csv = folder.write("a.csv", "time_s,p_a\n0,80\n1,81\n");
+    let pipe = folder.text("pipe.csv");
+    assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+    let path = folder.path("pipe.csv");
+    let reader = std::thread::spawn(move || std::fs::read_to_string(path).unwrap());
+    done(&["convert", &csv, &pipe]);
+    assert_eq!(reader.join().unwrap(), "time_s,p_a\n0,80\n1,81\n");
+    assert_eq!(folder.names(), ["a.csv", "pipe.csv"]);
+}
+
+#[test]
 fn a_parquet_record_may_tell_time_in_integers() {
     let folder = Folder::new();
     let fields = vec![

@@ -4,7 +4,7 @@
 //! values lie, and once to write it. What is written has its name when it is whole.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::columnar::{Cell, Field, Kind, Writer};
 use super::csv::{Row, TableWriter};
@@ -12,7 +12,8 @@ use super::error::FileError;
 use super::grid::{Grid, GridError, OnGrid};
 use super::record::Record;
 use super::table::TableFormat;
-use super::wfdb_write::{SignalRange, WfdbWriter};
+use super::wfdb;
+use super::wfdb_write::{self, SignalRange, WfdbWriter};
 use crate::edge::config::Config;
 use crate::estimate::time::EventTime;
 use crate::model::cvsim6::Pressures;
@@ -56,8 +57,12 @@ pub fn convert(
     options: &ConvertOptions,
     progress: Progress<'_>,
 ) -> Result<Converted, FileError> {
-    refuse_same(input, output)?;
     let target = Target::of(output)?;
+    let files = target.files(output);
+    refuse_same(input, output, &files)?;
+    if let [header, samples] = files.as_slice() {
+        refuse_foreign(header, samples)?;
+    }
     let survey = Survey::of(input, config, progress)?;
     let names = names(input, &survey.states, options)?;
     let grid = match (options.rate_hz, target) {
@@ -118,15 +123,30 @@ impl NotPlaced {
 }
 
 /// Writing over what is being read would lose it.
-fn refuse_same(input: &Path, output: &Path) -> Result<(), FileError> {
-    let same = |a: &Path, b: &Path| matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b);
-    let header = output.with_added_extension("hea");
-    let input_header = input.with_added_extension("hea");
-    let pairs = [(input, output), (input, header.as_path()), (&input_header, output), (&input_header, &header)];
-    if pairs.iter().any(|(a, b)| same(a, b)) {
+fn refuse_same(input: &Path, output: &Path, files: &[PathBuf]) -> Result<(), FileError> {
+    let read = Record::files(input)?;
+    if files.iter().any(|file| read.iter().any(|other| is_same(file, other))) {
         return Err(FileError::content(output, None, "the record that is read", "another file to write to"));
     }
     Ok(())
+}
+
+/// Whether two names are of one file that is there.
+fn is_same(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
+}
+
+/// A file of samples is replaced together with the header that names it; without that it is somebody else's.
+fn refuse_foreign(header: &Path, samples: &Path) -> Result<(), FileError> {
+    if !samples.exists() {
+        return Ok(());
+    }
+    let named = header.exists().then(|| wfdb::Record::open(header)).and_then(Result::ok);
+    if named.is_some_and(|record| record.files().iter().any(|file| is_same(file, samples))) {
+        return Ok(());
+    }
+    let expected = format!("no such file, or one that {} names", header.display());
+    Err(FileError::content(samples, None, "a file of something else", &expected))
 }
 
 /// How what is written is called, column by column.
@@ -217,6 +237,14 @@ impl Target {
                     ".csv, .parquet, or .hea or no ending for WFDB",
                 )),
             },
+        }
+    }
+
+    /// What is written: a table, or a header and its file of samples.
+    fn files(self, output: &Path) -> Vec<PathBuf> {
+        match self {
+            Self::Table(_) => vec![output.to_owned()],
+            Self::Wfdb => wfdb_write::files(output).to_vec(),
         }
     }
 }

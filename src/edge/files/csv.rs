@@ -5,6 +5,7 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use super::error::FileError;
+use super::whole::Destination;
 use crate::edge::config::Config;
 use crate::estimate::beat::BeatEstimate;
 use crate::estimate::ensemble::ParameterSummary;
@@ -140,23 +141,23 @@ impl RecordReader {
     }
 }
 
-/// Writes rows of numbers under a header. Numbers are written so that they read back exactly.
+/// Writes rows of numbers under a header. Numbers are written so that they read back exactly. The file has its name
+/// when it is finished, and not before.
 pub struct TableWriter {
     path: PathBuf,
-    writer: BufWriter<File>,
+    writer: BufWriter<Destination>,
     columns: usize,
     line: String,
 }
 
 impl TableWriter {
-    /// Creates the file and writes the header.
+    /// Begins the file and writes the header.
     ///
     /// # Errors
     /// When the file cannot be written.
     pub fn create(path: &Path, header: &[String]) -> Result<Self, FileError> {
-        let file = File::create(path).map_err(|e| FileError::file(path, &e))?;
-        let (path, columns) = (path.to_owned(), header.len());
-        let mut table = Self { path, writer: BufWriter::new(file), columns, line: header.join(",") };
+        let writer = BufWriter::new(Destination::create(path)?);
+        let mut table = Self { path: path.to_owned(), writer, columns: header.len(), line: header.join(",") };
         table.write_line()?;
         Ok(table)
     }
@@ -186,29 +187,29 @@ impl TableWriter {
         self.writer.write_all(self.line.as_bytes()).map_err(|e| FileError::file(&self.path, &e))
     }
 
-    /// Writes what is buffered.
+    /// Writes what is buffered and gives the file its name.
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn finish(mut self) -> Result<(), FileError> {
-        self.writer.flush().map_err(|e| FileError::file(&self.path, &e))
+    pub fn finish(self) -> Result<(), FileError> {
+        self.writer.into_inner().map_err(|e| FileError::file(&self.path, &e))?.finish()
     }
 }
 
-/// Writes what happened, row by row: `time_s, kind, channel, text`.
+/// Writes what happened, row by row: `time_s, kind, channel, text`. The file has its name when it is finished, and not
+/// before.
 pub struct EventWriter {
     path: PathBuf,
-    writer: csv::Writer<File>,
+    writer: csv::Writer<Destination>,
 }
 
 impl EventWriter {
-    /// Creates the file and writes the header.
+    /// Begins the file and writes the header.
     ///
     /// # Errors
     /// When the file cannot be written.
     pub fn create(path: &Path) -> Result<Self, FileError> {
-        let file = File::create(path).map_err(|e| FileError::file(path, &e))?;
-        let mut writer = csv::Writer::from_writer(file);
+        let mut writer = csv::Writer::from_writer(Destination::create(path)?);
         writer.write_record(["time_s", "kind", "channel", "text"]).map_err(|e| FileError::file(path, &e))?;
         Ok(Self { path: path.to_owned(), writer })
     }
@@ -222,12 +223,12 @@ impl EventWriter {
         self.writer.write_record([time.as_str(), kind, channel, text]).map_err(|e| FileError::file(&self.path, &e))
     }
 
-    /// Writes what is buffered.
+    /// Writes what is buffered and gives the file its name.
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn finish(mut self) -> Result<(), FileError> {
-        self.writer.flush().map_err(|e| FileError::file(&self.path, &e))
+    pub fn finish(self) -> Result<(), FileError> {
+        self.writer.into_inner().map_err(|e| FileError::file(&self.path, &e))?.finish()
     }
 }
 

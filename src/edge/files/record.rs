@@ -1,6 +1,6 @@
 //! A record of pressures, whatever the format: rows in order of time.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::csv::{RecordReader, Row};
 use super::error::FileError;
@@ -27,13 +27,24 @@ impl Record {
     /// # Errors
     /// When it cannot be read or holds no pressure.
     pub fn open(path: &Path, config: &Config) -> Result<Self, FileError> {
-        let is_header = path.extension().is_some_and(|ending| ending == "hea");
-        if is_header || (!path.exists() && path.with_added_extension("hea").exists()) {
+        if is_wfdb(path) {
             Ok(Self::Wfdb(WfdbRows::open(path, config)?))
         } else if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("parquet")) {
             Ok(Self::Parquet(Box::new(ParquetRows::open(path, config)?)))
         } else {
             Ok(Self::Csv(Box::new(RecordReader::open(path, config)?)))
+        }
+    }
+
+    /// Files that a record is read from.
+    ///
+    /// # Errors
+    /// When a header that names some cannot be read.
+    pub fn files(path: &Path) -> Result<Vec<PathBuf>, FileError> {
+        if is_wfdb(path) {
+            Ok(wfdb::Record::open(path)?.files().into_iter().collect())
+        } else {
+            Ok(vec![path.to_owned()])
         }
     }
 
@@ -58,6 +69,11 @@ impl Record {
             Self::Wfdb(rows) => Ok(rows.next_row()),
         }
     }
+}
+
+fn is_wfdb(path: &Path) -> bool {
+    let is_header = path.extension().is_some_and(|ending| ending == "hea");
+    is_header || (!path.exists() && path.with_added_extension("hea").exists())
 }
 
 /// The pressures of a WFDB record, side by side; each has its own rate.
@@ -89,7 +105,12 @@ impl WfdbRows {
         for (index, signal) in record.signals.iter().enumerate() {
             let state = config.state_of_label(&signal.name);
             let state = state.and_then(|name| Pressures::NAMES.iter().position(|known| *known == name));
-            let Some(state) = state.filter(|_| signal.units.eq_ignore_ascii_case("mmHg")) else { continue };
+            let Some(state) = state else { continue };
+            if !signal.units.eq_ignore_ascii_case("mmHg") {
+                let (name, found) = (Pressures::NAMES[state], &signal.units);
+                tracing::warn!("{}: a signal of {name} in {found}, expected mmHg, is ignored", signal.name);
+                continue;
+            }
             if states.contains(&state) {
                 tracing::warn!("{}: another signal of {} is ignored", signal.name, Pressures::NAMES[state]);
                 continue;

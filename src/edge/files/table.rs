@@ -72,7 +72,7 @@ impl Table {
         }
     }
 
-    /// Writes what is left; a Parquet file has its name only now.
+    /// Writes what is left; the file has its name only now.
     ///
     /// # Errors
     /// When the file cannot be written.
@@ -122,7 +122,7 @@ impl EventTable {
         }
     }
 
-    /// Writes what is left; a Parquet file has its name only now.
+    /// Writes what is left; the file has its name only now.
     ///
     /// # Errors
     /// When the file cannot be written.

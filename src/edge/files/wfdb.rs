@@ -150,6 +150,17 @@ impl Record {
         Ok(Self { signals, frame_rate_hz: rate_hz, frames, start: line.start, start_ns: 0, path, variable, segments })
     }
 
+    /// Files that it is read from: headers and files of samples, whether they are there or not.
+    #[must_use]
+    pub fn files(&self) -> BTreeSet<PathBuf> {
+        let sources = self.segments.iter().filter_map(|segment| segment.source.as_deref());
+        let own = |source: &Ordinary| {
+            let stored = source.channels.iter().filter_map(Channel::file).map(|name| source.path.with_file_name(name));
+            stored.chain([source.path.clone()]).collect::<Vec<_>>()
+        };
+        sources.flat_map(own).chain([self.path.clone()]).collect()
+    }
+
     /// All samples of the signal at this place in [`Self::signals`], in its units; NaN where one is missing.
     ///
     /// # Errors
@@ -942,6 +953,18 @@ mod tests {
         let read = folder.samples("m");
         assert!(same(&read[0], &[1.0, 2.0, NAN, 3.0, 1.0, 2.0]));
         assert!(same(&read[1], &[3.0, 4.0, 5.0, 6.0, NAN, NAN, 8.0, 9.0, 3.0, 4.0, 5.0, 6.0]));
+    }
+
+    #[test]
+    fn all_files_of_a_record_are_known() {
+        let folder = Folder::new();
+        folder.write("a.hea", "a 3 125 2\na.dat 80\na.dat 80\nb.dat 80\n").write("m.hea", "m/3 3 125\na 2\n~ 5\na 2\n");
+        let names = |record: &str| {
+            let files = folder.open(record).unwrap().files();
+            files.iter().map(|path| path.file_name().unwrap().to_str().unwrap().to_owned()).collect::<Vec<_>>()
+        };
+        assert_eq!(names("a"), ["a.dat", "a.hea", "b.dat"]);
+        assert_eq!(names("m.hea"), ["a.dat", "a.hea", "b.dat", "m.hea"]);
     }
 
     #[test]

@@ -79,6 +79,18 @@ struct Channel {
     checksum: i16,
 }
 
+/// Name of the record whose header this path is, with or without its ending; empty if it has none.
+fn name_of(path: &Path) -> String {
+    let stem = if path.extension().is_some_and(|e| e == "hea") { path.file_stem() } else { path.file_name() };
+    stem.map(|s| s.to_string_lossy().into_owned()).unwrap_or_default()
+}
+
+/// Header and file of samples of the record that is written to a path.
+pub(super) fn files(path: &Path) -> [PathBuf; 2] {
+    let name = name_of(path);
+    ["hea", "dat"].map(|ending| path.with_file_name(format!("{name}.{ending}")))
+}
+
 /// Writes a record frame by frame. The header has its name last, so that it never stands beside half a file.
 pub struct WfdbWriter {
     header: PathBuf,
@@ -95,8 +107,7 @@ impl WfdbWriter {
     /// # Errors
     /// When the name is none that WFDB allows, a range is beyond it, or the files cannot be written.
     pub fn create(path: &Path, signals: &[SignalRange], grid: Grid) -> Result<Self, FileError> {
-        let stem = if path.extension().is_some_and(|e| e == "hea") { path.file_stem() } else { path.file_name() };
-        let name = stem.map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
+        let name = name_of(path);
         let allowed = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
         if name.is_empty() || !name.chars().all(allowed) {
             let expected = "letters, digits, `_` and `-`, as the name of a WFDB record";
@@ -111,8 +122,8 @@ impl WfdbWriter {
             Ok(Channel { label: signal.label.clone(), calibration, first: 0, checksum: 0 })
         };
         let channels = signals.iter().map(channel).collect::<Result<_, _>>()?;
-        let samples = BufWriter::new(WholeFile::create(&path.with_file_name(format!("{name}.dat")))?);
-        let header = path.with_file_name(format!("{name}.hea"));
+        let [header, samples] = files(path);
+        let samples = BufWriter::new(WholeFile::create(&samples)?);
         Ok(Self { header, name, samples, channels, grid, frames: 0 })
     }
 

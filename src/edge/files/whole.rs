@@ -78,6 +78,56 @@ impl Drop for WholeFile {
     }
 }
 
+/// Where text goes: into a file that is whole as soon as it has its name, or into what has that name already and is no
+/// file of its own, such as a pipe, a device or a link, which is written to as it is.
+#[derive(Debug)]
+pub enum Destination {
+    /// A file.
+    Whole(WholeFile),
+    /// Something else.
+    Other(File),
+}
+
+impl Destination {
+    /// Begins the file, or opens what is there.
+    ///
+    /// # Errors
+    /// When it cannot be written, or the path names no file.
+    pub fn create(path: &Path) -> Result<Self, FileError> {
+        if path.symlink_metadata().is_ok_and(|about| !about.is_file()) {
+            return File::create(path).map(Self::Other).map_err(|e| FileError::file(path, &e));
+        }
+        WholeFile::create(path).map(Self::Whole)
+    }
+
+    /// Gives the file its name.
+    ///
+    /// # Errors
+    /// When the disk refuses it.
+    pub fn finish(self) -> Result<(), FileError> {
+        match self {
+            Self::Whole(file) => file.finish().map(|_| ()),
+            Self::Other(_) => Ok(()),
+        }
+    }
+}
+
+impl Write for Destination {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        match self {
+            Self::Whole(file) => file.write(bytes),
+            Self::Other(file) => file.write(bytes),
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        match self {
+            Self::Whole(file) => file.flush(),
+            Self::Other(file) => file.flush(),
+        }
+    }
+}
+
 /// Whether a name is that of a file that was never finished.
 #[must_use]
 pub fn is_unfinished(name: &str) -> bool {
@@ -117,5 +167,24 @@ mod tests {
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
         let nowhere = WholeFile::create(&folder.path().join("none/a.bin")).unwrap_err().to_string();
         assert!(nowhere.contains("none/a.bin: No such file"), "{nowhere}");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn what_is_no_file_of_its_own_is_written_to_as_it_is() {
+        let folder = tempfile::tempdir().unwrap();
+        let [file, link, null] = ["a.csv", "link.csv", "null.csv"].map(|name| folder.path().join(name));
+        std::os::unix::fs::symlink(&file, &link).unwrap();
+        std::os::unix::fs::symlink("/dev/null", &null).unwrap();
+        for path in [&file, &link, &null] {
+            let mut destination = Destination::create(path).unwrap();
+            destination.write_all(path.as_os_str().as_encoded_bytes()).unwrap();
+            assert_eq!(matches!(destination, Destination::Whole(_)), *path == file);
+            destination.finish().unwrap();
+        }
+        assert_eq!(std::fs::read(&file).unwrap(), link.as_os_str().as_encoded_bytes());
+        assert!(link.is_symlink() && null.is_symlink());
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 3);
+        assert!(Destination::create(folder.path()).is_err());
     }
 }

@@ -16,6 +16,7 @@ use std::ops::RangeInclusive;
 
 use crate::edge::bus::Message;
 use crate::edge::recent::{self, MAX_ASKED, MAX_END};
+use crate::estimate::time::NS_PER_S;
 
 /// Longest wait for an answer, in arrivals \[ns\]. An answer is behind all that is on the way already, which is what a link
 /// that drops has much of.
@@ -38,6 +39,9 @@ const LONGEST_LOOK_NS: i64 = 250_000_000;
 
 /// Most messages that are asked for before the first of a run: a recorder that came late does not ask.
 const MAX_BEGINNING: u64 = 256;
+
+/// What has been silent for so long \[ns\] is forgotten: keys come and go with patients.
+pub const FORGET_NS: i64 = 3600 * NS_PER_S;
 
 /// Keys whose numbers are followed, and gaps that are asked for at a time; what is beyond is lost at once.
 const MAX_KEYS: usize = 16_384;
@@ -354,8 +358,8 @@ impl Gaps {
         }
     }
 
-    /// Everything until this time \[ns\] has been taken: gives up what has not come in time, and asks for what is after
-    /// the last message of keys that are quiet.
+    /// Everything until this time \[ns\] has been taken: gives up what has not come in time, asks for what is after the
+    /// last message of keys that are quiet, and forgets those that have been for an hour.
     pub fn advance(&mut self, now_ns: i64) {
         self.now_ns = self.now_ns.max(now_ns);
         if self.now_ns.saturating_sub(self.looked_ns) < LOOK_NS {
@@ -366,6 +370,8 @@ impl Gaps {
         }
         self.looked_ns = self.now_ns;
         self.give_up(|gap| now_ns.saturating_sub(gap.since_ns) >= PATIENCE_NS);
+        let forgotten_ns = now_ns.saturating_sub(FORGET_NS);
+        self.runs.retain(|_, run| run.heard_ns.is_none_or(|heard| heard >= forgotten_ns));
         let awake_ns = self.awake_ns;
         self.ask_ends(|run| {
             let silence = now_ns.saturating_sub(run.heard_ns.unwrap_or(now_ns).max(awake_ns));
@@ -644,6 +650,21 @@ mod tests {
         gaps.close();
         assert_eq!(numbers(&mut gaps, "a"), (0..=14).chain([13]).collect::<Vec<_>>());
         assert_eq!(gaps.lost(), 0);
+    }
+
+    #[test]
+    fn a_key_that_is_silent_for_an_hour_is_forgotten() {
+        let (mut gaps, hour) = (Gaps::default(), FORGET_NS / MS);
+        take(&mut gaps, "a", 7000, 0);
+        take(&mut gaps, "b", 7000, 1000);
+        gaps.advance((hour + 500) * MS);
+        assert_eq!(gaps.runs.keys().collect::<Vec<_>>(), ["b"]);
+        // What it sends then is taken for a beginning, and what came before is not missed.
+        take(&mut gaps, "a", 9000, hour + 500);
+        take(&mut gaps, "a", 9001, hour + 501);
+        gaps.close();
+        assert_eq!((numbers(&mut gaps, "a"), gaps.lost()), (vec![7000, 9000, 9001], 0));
+        assert_eq!(gaps.request(), None);
     }
 
     #[test]

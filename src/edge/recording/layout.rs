@@ -68,7 +68,13 @@ fn date(days: i64) -> (i64, i64, i64) {
 /// Folder of a table, bed (escaped) and hour.
 #[must_use]
 pub fn folder(recording: &Path, table: &str, bed: &str, hour: &str) -> PathBuf {
-    recording.join(table).join(format!("bed={bed}")).join(format!("hour={hour}"))
+    hour_folder(&recording.join(table).join(format!("bed={bed}")), hour)
+}
+
+/// Folder of an hour, in that of a bed.
+#[must_use]
+pub fn hour_folder(bed: &Path, hour: &str) -> PathBuf {
+    bed.join(format!("hour={hour}"))
 }
 
 /// A file of a folder, and which parts it holds.

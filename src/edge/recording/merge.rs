@@ -1,7 +1,7 @@
 //! Small parts of a folder become bigger ones.
 
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
 use std::thread::JoinHandle;
 
 use super::layout::{Part, Parts, remove};
@@ -13,6 +13,9 @@ const BATCH: usize = 4096;
 
 /// Merges that may wait; one that finds no place is asked for again later.
 const QUEUE: usize = 4096;
+
+/// Old folders that are still tidied when no more is asked for: years of them are left to the next start.
+const MAX_AT_END: usize = 256;
 
 /// A folder to look at.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -64,6 +67,16 @@ fn merge_run(folder: &Path, parts: &[&Part], fields: &[Field]) -> Result<(), Fil
     parts.iter().try_for_each(|part| remove(&part.path))
 }
 
+/// Removes what an interruption left in a folder into which nobody writes any more, and merges all of its parts.
+///
+/// # Errors
+/// When a part is damaged or the folder cannot be written.
+pub fn tidy(folder: PathBuf) -> Result<(), FileError> {
+    let parts = Parts::of(&folder)?;
+    parts.clean()?;
+    if parts.live.len() > 1 { merge(&Job { folder, all: true }) } else { Ok(()) }
+}
+
 /// A thread that merges, beside the one that records.
 pub struct Merger {
     jobs: Option<SyncSender<Job>>,
@@ -71,13 +84,13 @@ pub struct Merger {
 }
 
 impl Merger {
-    /// Starts it.
+    /// Starts it. Whenever nothing else is asked for, it [tidies](tidy) the next of these old folders.
     ///
     /// # Errors
     /// When there is no thread to be had.
-    pub fn start() -> std::io::Result<Self> {
+    pub fn start(old: impl Iterator<Item = PathBuf> + Send + 'static) -> std::io::Result<Self> {
         let (jobs, receiver) = sync_channel(QUEUE);
-        let thread = std::thread::Builder::new().name("merge".to_owned()).spawn(move || work(&receiver))?;
+        let thread = std::thread::Builder::new().name("merge".to_owned()).spawn(move || work(&receiver, old))?;
         Ok(Self { jobs: Some(jobs), thread: Some(thread) })
     }
 
@@ -89,7 +102,7 @@ impl Merger {
 }
 
 impl Drop for Merger {
-    /// Finishes what is asked for.
+    /// Finishes what is asked for, and some of the old folders.
     fn drop(&mut self) {
         self.jobs = None;
         if let Some(thread) = self.thread.take() {
@@ -98,11 +111,32 @@ impl Drop for Merger {
     }
 }
 
-fn work(jobs: &Receiver<Job>) {
-    for job in jobs {
-        // Parts that stay small are read as well as big ones; what is wrong with the disk the recorder says.
-        if let Err(error) = merge(&job) {
-            tracing::warn!("parts are left unmerged: {error}");
+fn work(jobs: &Receiver<Job>, old: impl Iterator<Item = PathBuf>) {
+    let mut at_end = 0;
+    for folder in old {
+        at_end += usize::from(!merge_asked(jobs));
+        if at_end > MAX_AT_END {
+            return;
         }
+        say(tidy(folder));
+    }
+    jobs.iter().for_each(|job| say(merge(&job)));
+}
+
+/// Merges what is asked for now; false if no more will be.
+fn merge_asked(jobs: &Receiver<Job>) -> bool {
+    loop {
+        match jobs.try_recv() {
+            Ok(job) => say(merge(&job)),
+            Err(TryRecvError::Empty) => return true,
+            Err(TryRecvError::Disconnected) => return false,
+        }
+    }
+}
+
+/// Parts that stay small are read as well as big ones; what is wrong with the disk the recorder says.
+fn say(merged: Result<(), FileError>) {
+    if let Err(error) = merged {
+        tracing::warn!("parts are left unmerged: {error}");
     }
 }

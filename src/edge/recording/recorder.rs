@@ -1,6 +1,6 @@
 //! From the bus to the files of a recording.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
@@ -8,9 +8,10 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use super::gaps::{Gaps, PATIENCE_NS, Request};
+use super::arrival::ArrivalClock;
+use super::gaps::{FORGET_NS, Gaps, PATIENCE_NS, Request};
 use super::layout::{self, Part, Parts};
-use super::merge::{Job, Merger, merge};
+use super::merge::{Job, Merger};
 use super::tables::{self, BedMemory, Entry, Table};
 use crate::edge::bus::{Bus, BusError, Delivery, Encoding, Handler, Message, Subscription};
 use crate::edge::files::columnar::{Batch, Field, Writer};
@@ -18,8 +19,7 @@ use crate::edge::files::error::FileError;
 use crate::edge::files::units::Units;
 use crate::edge::recent;
 use crate::edge::wire;
-use crate::estimate::time::ns_from_s;
-use crate::runtime::clock::{Clock, unix_time};
+use crate::estimate::time::{NS_PER_S, ns_from_s};
 
 /// What is recorded, under `PREFIX/BED/`. No JSON twins, which would be made for the recorder only.
 const TOPICS: [&str; 12] = [
@@ -53,6 +53,11 @@ const QUEUE_BYTES: usize = 256 << 20;
 /// Longest wait for a message before looking at what is due.
 const LOOK: Duration = Duration::from_millis(50);
 
+/// Time between looks at the system clock \[ns\].
+const COMPARE_NS: i64 = NS_PER_S;
+
+const HOUR_NS: i64 = 3600 * NS_PER_S;
+
 /// Parts of an hour that were never merged, at most: then they are.
 const SMALL_PARTS: u64 = 32;
 
@@ -75,7 +80,7 @@ pub struct RecordOptions {
     pub members: bool,
     /// Longest time that a row waits in memory \[s\].
     pub flush_s: f64,
-    /// Most beds; messages of others are refused.
+    /// Most beds at a time; messages of others are refused. One that has been silent for an hour makes room.
     pub max_beds: usize,
 }
 
@@ -112,6 +117,14 @@ pub enum RecordError {
     Bus(#[from] BusError),
 }
 
+/// A bed that is recorded.
+#[derive(Default)]
+struct Bed {
+    memory: BedMemory,
+    /// Arrival of the last message of it that was understood \[ns\].
+    heard_ns: i64,
+}
+
 /// Rows of one table and bed that wait to be written.
 struct Buffer {
     hour: String,
@@ -139,37 +152,44 @@ pub struct Recorder {
     options: RecordOptions,
     units: Units,
     buffers: BTreeMap<(String, Table), Buffer>,
-    beds: BTreeMap<String, BedMemory>,
+    beds: BTreeMap<String, Bed>,
+    /// Names of all beds so far, also of those that are forgotten: as many as there are folders on the disk.
+    seen: BTreeSet<String>,
     /// Where messages wait for those that are missing.
     gaps: Gaps,
     /// Cells in all buffers.
     cells: usize,
     summary: Summary,
+    /// Whether no more messages come.
+    is_ending: bool,
     merger: Merger,
     /// Held for as long as this recorder writes here.
     _lock: File,
 }
 
 impl Recorder {
-    /// Opens a directory, new or recorded into before; removes what an interruption left and merges the hours that are
-    /// over by `now_ns`.
+    /// Opens a directory, new or recorded into before; removes what an interruption left about `now_ns`. What it left
+    /// before is removed, and hours that are over are merged, beside the recording.
     ///
     /// # Errors
     /// When it cannot be written, or somebody else records into it.
     pub fn open(directory: &Path, options: RecordOptions, units: Units, now_ns: i64) -> Result<Self, FileError> {
         std::fs::create_dir_all(directory).map_err(|e| FileError::file(directory, &e))?;
         let lock = lock(directory)?;
-        let merger = Merger::start().map_err(|e| FileError::file(directory, &e))?;
-        tidy(directory, now_ns)?;
+        let old = hours_before(directory, &layout::hour(now_ns.saturating_sub(HOUR_NS)));
+        let merger = Merger::start(old).map_err(|e| FileError::file(directory, &e))?;
+        tidy_recent(directory, now_ns, &merger)?;
         Ok(Self {
             directory: directory.to_owned(),
             options,
             units,
             buffers: BTreeMap::new(),
             beds: BTreeMap::new(),
+            seen: BTreeSet::new(),
             gaps: Gaps::default(),
             cells: 0,
             summary: Summary::default(),
+            is_ending: false,
             merger,
             _lock: lock,
         })
@@ -248,16 +268,34 @@ impl Recorder {
         if !known && self.beds.len() >= self.options.max_beds {
             return Ok(Err("too_many_beds"));
         }
-        let memory = self.beds.entry(bed.to_owned()).or_default();
+        let Bed { memory, .. } = self.beds.entry(bed.to_owned()).or_default();
         let outcome = match tables::entry(topic, message, arrival, memory) {
             Ok(entry) => self.add_entry(bed, entry, arrival)?,
             Err(cause) => Err(cause),
         };
-        // What nobody understands makes no bed.
-        if outcome.is_err() && !known {
+        if outcome.is_ok() {
+            self.hear(bed, arrival);
+        } else if !known {
+            // What nobody understands makes no bed.
             self.beds.remove(bed);
         }
         Ok(outcome)
+    }
+
+    fn hear(&mut self, name: &str, arrival: i64) {
+        if let Some(bed) = self.beds.get_mut(name) {
+            bed.heard_ns = arrival;
+        }
+        if !self.seen.contains(name) {
+            self.seen.insert(name.to_owned());
+        }
+    }
+
+    /// Makes room for other beds: forgets those that have been silent for long and have nothing to be written.
+    fn forget(&mut self, now_ns: i64) {
+        let (buffers, since_ns) = (&self.buffers, now_ns.saturating_sub(FORGET_NS));
+        let is_buffered = |name: &String| buffers.keys().any(|(bed, _)| bed == name);
+        self.beds.retain(|name, bed| bed.heard_ns >= since_ns || is_buffered(name));
     }
 
     fn add_entry(&mut self, bed: &str, entry: Entry, arrival: i64) -> Result<Result<(), tables::Refused>, FileError> {
@@ -314,6 +352,10 @@ impl Recorder {
         let before = buffer.cells();
         entry.rows.into_iter().for_each(|row| buffer.batch.push(row));
         self.cells += buffer.cells() - before;
+        // What is in line at the end is bounded, and is written with the rest.
+        if self.is_ending {
+            return Ok(());
+        }
         if buffer.cells() >= MAX_CELLS {
             self.write(key)?;
         }
@@ -321,7 +363,7 @@ impl Recorder {
     }
 
     /// Writes what has waited long enough by a unix time up to which all messages have been taken, and lets go of hours
-    /// that are over.
+    /// that are over and of beds that are silent.
     ///
     /// # Errors
     /// When the disk does not take it.
@@ -338,25 +380,32 @@ impl Recorder {
         for buffer in over.iter().filter_map(|key| self.buffers.remove(key)) {
             let _ = self.merger.ask(Job { folder: buffer.folder, all: true });
         }
+        self.forget(now_ns);
         Ok(())
     }
 
+    /// Writes all buffers, also after one that cannot be written; the first error.
     fn write_all(&mut self) -> Result<(), FileError> {
         let keys: Vec<_> = self.buffers.keys().cloned().collect();
-        keys.iter().try_for_each(|key| self.write(key))
+        let mut outcome = Ok(());
+        for key in &keys {
+            outcome = outcome.and(self.write(key));
+        }
+        outcome
     }
 
-    /// Makes a file of what waits in a buffer.
+    /// Makes a file of what waits in a buffer, where it stays if that fails.
     fn write(&mut self, key: &(String, Table)) -> Result<(), FileError> {
         let Some(buffer) = self.buffers.get_mut(key).filter(|b| b.batch.rows() > 0) else { return Ok(()) };
         std::fs::create_dir_all(&buffer.folder).map_err(|e| FileError::file(&buffer.folder, &e))?;
         let part = Part::new(&buffer.folder, buffer.next_part, buffer.next_part);
         let about = [(WIRE_KEY, wire::SCHEMA.to_string()), (TABLE_KEY, key.1.name().to_owned())];
         let mut writer = Writer::create(&part.path, buffer.fields.clone(), &about)?;
-        self.cells -= buffer.cells();
-        writer.batch(std::mem::replace(&mut buffer.batch, Batch::new(&buffer.fields)))?;
+        writer.batch(buffer.batch.clone())?;
         self.summary.bytes += writer.finish()?;
         self.summary.parts += 1;
+        self.cells -= buffer.cells();
+        buffer.batch = Batch::new(&buffer.fields);
         buffer.next_part += 1;
         buffer.small += 1;
         if buffer.small >= SMALL_PARTS && self.merger.ask(Job { folder: buffer.folder.clone(), all: false }) {
@@ -365,19 +414,37 @@ impl Recorder {
         Ok(())
     }
 
-    /// Writes what is left, gives up what is missing, and merges what is small.
+    /// Writes what is left, gives up what is missing, and merges what is small. What one folder does not take keeps
+    /// nothing else from the disk.
     ///
     /// # Errors
-    /// When the disk does not take it.
+    /// When the disk does not take all of it.
     pub fn close(mut self) -> Result<Summary, FileError> {
+        self.is_ending = true;
         self.gaps.close();
-        self.add_due()?;
-        self.write_all()?;
+        let added = self.add_rest();
+        let written = self.write_all();
+        let left: usize = self.buffers.values().map(|buffer| buffer.batch.rows()).sum();
+        if left > 0 {
+            tracing::warn!(rows = left, "rows could not be written and are lost");
+        }
+        added.and(written)?;
         for buffer in self.buffers.values() {
             let _ = self.merger.ask(Job { folder: buffer.folder.clone(), all: false });
         }
         let (recovered, lost) = (self.gaps.recovered(), self.gaps.lost());
-        Ok(Summary { beds: self.beds.len(), recovered, lost, ..self.summary })
+        Ok(Summary { beds: self.seen.len(), recovered, lost, ..self.summary })
+    }
+
+    /// Makes rows of all messages in line, also after one that failed; the first error.
+    fn add_rest(&mut self) -> Result<(), FileError> {
+        let mut outcome = Ok(());
+        loop {
+            match self.add_due() {
+                Ok(()) => return outcome,
+                failed => outcome = outcome.and(failed),
+            }
+        }
     }
 }
 
@@ -394,41 +461,41 @@ fn lock(directory: &Path) -> Result<File, FileError> {
     }
 }
 
-/// Removes what an interruption left, and merges the hours that are over.
-fn tidy(directory: &Path, now_ns: i64) -> Result<(), FileError> {
-    let current = format!("hour={}", layout::hour(now_ns));
+/// Removes what an interruption left in this hour, into which is written, and in the one before, where a quick restart
+/// finds most of it; the parts of the latter are merged by and by.
+fn tidy_recent(directory: &Path, now_ns: i64, merger: &Merger) -> Result<(), FileError> {
+    let (current, before) = (layout::hour(now_ns), layout::hour(now_ns.saturating_sub(HOUR_NS)));
     for table in Table::ALL {
         for (_, bed) in layout::beds(directory, table.name())? {
-            for folder in layout::hours(&bed)? {
-                let parts = Parts::of(&folder)?;
-                parts.clean()?;
-                if parts.live.len() > 1 && !folder.ends_with(&current) {
-                    // A part that somebody damaged is no reason not to record.
-                    if let Err(error) = merge(&Job { folder, all: true }) {
-                        tracing::warn!("parts are left unmerged: {error}");
-                    }
-                }
+            Parts::of(&layout::hour_folder(&bed, &current))?.clean()?;
+            let folder = layout::hour_folder(&bed, &before);
+            let parts = Parts::of(&folder)?;
+            parts.clean()?;
+            if parts.live.len() > 1 {
+                let _ = merger.ask(Job { folder, all: true });
             }
         }
     }
     Ok(())
 }
 
-/// Wall clock that never goes back: set once, and counted on from there.
-#[derive(Clone, Copy)]
-struct ArrivalClock {
-    start_ns: i64,
-    clock: Clock,
+/// Folders of the hours before this one, listed bed by bed as they are asked for: into these nobody writes.
+fn hours_before(directory: &Path, hour: &str) -> impl Iterator<Item = PathBuf> + Send + use<> {
+    let (directory, end) = (directory.to_owned(), layout::hour_folder(Path::new(""), hour));
+    let beds = Table::ALL.into_iter().flat_map(move |table| listed(layout::beds(&directory, table.name())));
+    beds.flat_map(move |(_, bed)| {
+        let mut hours = listed(layout::hours(&bed));
+        hours.retain(|folder| folder.file_name().is_some_and(|name| name < end.as_os_str()));
+        hours
+    })
 }
 
-impl ArrivalClock {
-    fn start() -> Self {
-        Self { start_ns: unix_time().0, clock: Clock::start() }
-    }
-
-    fn now_ns(&self) -> i64 {
-        self.start_ns.saturating_add(self.clock.now().0)
-    }
+/// What was listed; nothing where a folder cannot be read, which is no reason not to record into others.
+fn listed<T>(found: Result<Vec<T>, FileError>) -> Vec<T> {
+    found.unwrap_or_else(|error| {
+        tracing::warn!("older hours are left as they are: {error}");
+        Vec::new()
+    })
 }
 
 /// A bounded queue between the threads of the bus and the recorder.
@@ -441,7 +508,7 @@ struct Queue {
 fn subscribe(
     bus: &dyn Bus,
     options: &RecordOptions,
-    clock: ArrivalClock,
+    clock: Arc<ArrivalClock>,
 ) -> Result<(Vec<Subscription>, Queue), BusError> {
     let (sender, receiver): (SyncSender<(i64, Message)>, _) = sync_channel(QUEUE);
     let queue = Queue { receiver, bytes: Arc::default(), dropped: Arc::default() };
@@ -476,9 +543,9 @@ pub fn run(
     stop: &AtomicBool,
     progress: &mut dyn FnMut(u64, u64),
 ) -> Result<Summary, RecordError> {
-    let clock = ArrivalClock::start();
+    let clock = Arc::new(ArrivalClock::start());
     let recorder = Recorder::open(directory, options.clone(), units, clock.now_ns())?;
-    let (subscriptions, queue) = subscribe(bus, &options, clock)?;
+    let (subscriptions, queue) = subscribe(bus, &options, Arc::clone(&clock))?;
     let (requests, waiting) = sync_channel(ASKED);
     let (found, answers) = sync_channel(ASKED);
     let asker = Asker { bus, prefix: &options.prefix, requests: Mutex::new(waiting), answers: found };
@@ -491,10 +558,12 @@ pub fn run(
         }
         // These threads end when nobody asks and nobody listens any more: with this loop, however it ends.
         let _working: SyncSender<()> = working;
-        let mut work = Loop { recorder, queue, requests, answers, clock, looked_ns: clock.now_ns(), said: 0 };
-        work.run(stop, progress)?;
+        let now_ns = clock.now_ns();
+        let (looked_ns, compared_ns, said) = (now_ns, now_ns, Said::default());
+        let mut work = Loop { recorder, queue, requests, answers, clock, looked_ns, compared_ns, said };
+        let ran = work.run(stop, progress);
         drop(subscriptions);
-        work.finish()
+        work.finish(ran)
     })
 }
 
@@ -554,10 +623,27 @@ struct Loop {
     requests: SyncSender<Request>,
     /// Beside the queue: behind the messages in it they might come too late.
     answers: Receiver<Answer>,
-    clock: ArrivalClock,
+    clock: Arc<ArrivalClock>,
+    /// When was last looked at what is due, and at the system clock.
     looked_ns: i64,
-    /// Dropped messages at which there will be a warning.
-    said: u64,
+    compared_ns: i64,
+    said: Said,
+}
+
+/// Counts as they were last said, by what they count.
+#[derive(Default)]
+struct Said(BTreeMap<&'static str, u64>);
+
+impl Said {
+    /// Whether a count is said now: when there is something at first, and whenever that has doubled.
+    fn is_due(&mut self, what: &'static str, count: u64) -> bool {
+        let said = self.0.entry(what).or_default();
+        let is_due = count > 0 && count / 2 >= *said;
+        if is_due {
+            *said = count;
+        }
+        is_due
+    }
 }
 
 impl Loop {
@@ -578,6 +664,10 @@ impl Loop {
                 self.looked_ns = now_ns;
                 self.recorder.flush_due(taken_ns)?;
                 progress(self.recorder.summary.rows.values().sum(), self.warn());
+            }
+            if now_ns - self.compared_ns >= COMPARE_NS {
+                self.compared_ns = now_ns;
+                self.clock.compare();
             }
         }
         Ok(())
@@ -602,18 +692,34 @@ impl Loop {
         Ok(())
     }
 
-    /// Messages that were dropped.
+    /// Says what does not get to the disk; messages that were dropped.
     fn warn(&mut self) -> u64 {
-        let dropped = self.queue.dropped.load(Ordering::Relaxed);
-        if dropped > self.said {
+        let (dropped, lost) = (self.queue.dropped.load(Ordering::Relaxed), self.recorder.gaps.lost());
+        if self.said.is_due("dropped", dropped) {
             tracing::warn!(dropped, "messages were dropped because the disk was behind");
-            self.said = (2 * dropped).max(1);
+        }
+        if self.said.is_due("lost", lost) {
+            tracing::warn!(lost, "messages never came, by their sequence numbers");
+        }
+        for (&cause, &refused) in &self.recorder.summary.refused {
+            if self.said.is_due(cause, refused) {
+                tracing::warn!(cause, refused, "messages are not recorded");
+            }
         }
         dropped
     }
 
-    /// Takes what is left in the queue, waits for what is missing, and closes.
-    fn finish(mut self) -> Result<Summary, RecordError> {
+    /// Closes, whatever went wrong so far: what can be written is. If all went well, with what is still on its way.
+    fn finish(mut self, ran: Result<(), FileError>) -> Result<Summary, RecordError> {
+        let taken = ran.and_then(|()| self.take_rest());
+        let dropped = self.queue.dropped.load(Ordering::Relaxed);
+        let closed = self.recorder.close();
+        taken?;
+        Ok(Summary { dropped, ..closed? })
+    }
+
+    /// Takes what is left in the queue, and waits for what is missing.
+    fn take_rest(&mut self) -> Result<(), FileError> {
         while let Ok((arrival, message)) = self.queue.receiver.try_recv() {
             self.take(message, arrival)?;
             self.ask_and_answer()?;
@@ -626,7 +732,19 @@ impl Loop {
                 self.recorder.answer(id, messages)?;
             }
         }
-        let dropped = self.queue.dropped.load(Ordering::Relaxed);
-        Ok(Summary { dropped, ..self.recorder.close()? })
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_are_said_at_first_and_whenever_they_have_doubled() {
+        let mut said = Said::default();
+        let due: Vec<u64> = (0..=20).filter(|count| said.is_due("lost", *count)).collect();
+        assert_eq!(due, [1, 2, 4, 8, 16]);
+        assert!(said.is_due("malformed", 5) && !said.is_due("malformed", 9) && said.is_due("malformed", 11));
     }
 }

@@ -26,7 +26,7 @@ use crate::edge::files::columnar::{Cell, Field, Kind};
 use crate::edge::files::units::Units;
 use crate::edge::wire::{
     Acknowledge, Alarms, BEAT_STATISTICS, BeatEstimate, Beats, Event, Header, Members, Note, PARAMETER_STATISTICS,
-    ParameterEstimate, PressureBlock, STATE_STATISTICS, StateEstimate, Status, Truth, decode,
+    ParameterEstimate, PressureBlock, STATE_STATISTICS, StateEstimate, Status, Truth, WireError, decode,
 };
 
 /// Most names in a message.
@@ -152,7 +152,11 @@ impl Entry {
 }
 
 fn read<T: serde::de::DeserializeOwned>(message: &Message) -> Result<T, Refused> {
-    decode(&message.payload, message.encoding).map_err(|_| "malformed")
+    decode(&message.payload, message.encoding).map_err(|error| match error {
+        WireError::TooLong(_) => "oversized",
+        WireError::Malformed(_) => "malformed",
+        WireError::Schema(_) => "wrong_schema",
+    })
 }
 
 /// Times of the samples of a block; None if it does not say when they were taken.
