@@ -763,7 +763,7 @@ class Alarm:
 
 @dataclass(frozen=True)
 class Alarms:
-    """What stands against the limits of a bed, whenever an alarm changes (key `alarm`)."""
+    """What stands against the limits of a bed, whenever an alarm changes and with every status (key `alarm`)."""
 
     KEY: ClassVar[str] = "alarm"
 

@@ -235,6 +235,7 @@ class Follower:
         self.twins = TwinCheck() if both else None
         self.beds: dict[str, Bed] = {}
         self.received = 0
+        self._alarms: dict[str, list[tuple[str, str, bool]]] = {}
         self.counters: Counter[str] = Counter()
 
     def handle(self, received: Received, now_s: float) -> None:
@@ -307,6 +308,12 @@ class Follower:
             where = f"{key}, sequence {message.header.sequence}"
             warn(f"{where}: bincode and JSON differ in {'; '.join(found[:3])}")
 
+    def _is_news(self, bed: str, message: Alarms) -> bool:
+        """Whether an alarm has changed: alarms are said again with every status."""
+        now = [(alarm.name, alarm.state, alarm.acknowledged) for alarm in message.alarms]
+        before, self._alarms[bed] = self._alarms.get(bed), now
+        return now != before
+
     def _take(self, bed: str, topic: str, message: Published, now_s: float) -> None:
         if topic == SMOOTHED_KEY:
             # Of the same times once more, and later: not for the live line, nor for the rows.
@@ -316,7 +323,7 @@ class Follower:
             print(event_line(bed, message), flush=True)
         elif isinstance(message, BeatEstimate):
             print(beat_line(bed, message), flush=True)
-        elif isinstance(message, Alarms):
+        elif isinstance(message, Alarms) and self._is_news(bed, message):
             for line in alarm_lines(bed, message):
                 print(line, flush=True)
         if self._rows is None or not isinstance(message, StateEstimate | ParameterEstimate):

@@ -531,6 +531,7 @@ class Loopback(InDirectory):
             self.publisher.put(SMOOTHED_KEY, smoothed_bytes(1, 5), smoothed_json(1, 5))
             self.publisher.put("estimate/beat", beat_bytes(1, 1_000_000_000), beat_json(1, 1_000_000_000))
             self.publisher.put("alarm", alarm_bytes(0, 5, "active"), alarm_json(0, 5, "active"))
+            self.publisher.put("alarm", alarm_bytes(1, 6, "active"), alarm_json(1, 6, "active"))
             self.publisher.put("note", Note(5, "Dr. Weber", "250 mL").encode())
             self.publisher.put("event", event_bytes(0, 5, "over"), event_json(0, 5, "over"))
             last = f"{parameter_values(times[-1])[0]:#.4g}"
@@ -538,7 +539,8 @@ class Loopback(InDirectory):
             code, complaints = self.interrupt(process)
         self.assertEqual(code, 0, complaints)
         self.assertIn("bed1  0.000 s  EVENT gap p_a: over", seen)
-        self.assertIn("bed1  0.000 s  ALARM high low output: active: too little", seen)
+        alarms = [line for line in seen if "  ALARM high" in line]
+        self.assertEqual(alarms, ["bed1  0.000 s  ALARM high low output: active: too little"], "said again is no news")
         self.assertIn("bed1  0.000 s  NOTE by Dr. Weber: 250 mL", seen)
         self.assertIn("ALARM low output", seen[-1])
         self.assertEqual(seen.count(BEAT_LINE), 1)

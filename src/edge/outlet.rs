@@ -16,8 +16,8 @@ use super::bus::{self, Bus, BusError, Delivery, Encoding, Message, Subscription}
 use super::config::Config;
 use super::recent::{self, Payload, Recent};
 use super::wire::{
-    self, Alarm, Alarms, BeatEstimate, ChannelStatus, Event, Header, Members, ParameterEstimate, SCHEMA, StateEstimate,
-    Status, ToJson,
+    self, Alarm, Alarms, BeatEstimate, ChannelStatus, Event, GONE, Header, Members, ParameterEstimate, SCHEMA,
+    StateEstimate, Status, ToJson,
 };
 use crate::estimate::alarm::{AlarmReport, AlarmSettings};
 use crate::estimate::beat;
@@ -270,6 +270,12 @@ impl Sink for Outlet {
     }
 
     fn gone(&self, bed: &str) {
+        tracing::info!(bed, "let go: silent for long, and there is a new bed");
+        let key = self.key(bed, "event");
+        let header = self.header(&key, self.newest_time(bed));
+        let text = "let go: silent for long, and there is a new bed".to_owned();
+        let event = Event { header, kind: GONE.to_owned(), channel: String::new(), text };
+        self.send(key, &event, Delivery::Events);
         let below = self.key(bed, "");
         self.last.lock().unwrap_or_else(PoisonError::into_inner).retain(|key, _| !key.starts_with(&below));
         self.sequences.lock().unwrap_or_else(PoisonError::into_inner).retain(|key, _| !key.starts_with(&below));

@@ -223,6 +223,9 @@ pub struct Event {
     pub text: String,
 }
 
+/// Kind of the event by which a daemon says that it has let a bed go: the last message of the bed.
+pub const GONE: &str = "gone";
+
 /// One alarm of a bed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Alarm {

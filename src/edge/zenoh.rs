@@ -19,7 +19,8 @@ use super::config::{ZenohMode, ZenohSettings};
 /// Requests for last values that may wait; more are not answered.
 const MAX_WAITING_QUERIES: usize = 256;
 
-/// Keys whose publishers are kept declared; more than this are published without.
+/// Keys whose publishers are kept declared. If there are more, as beds come and go for months, all are let go, and those
+/// in use are declared again.
 const MAX_PUBLISHERS: usize = 16_384;
 
 /// Publishers of a key: what congestion does to a message is a matter of its publisher, so that there is one for each
@@ -112,9 +113,12 @@ impl ZenohBus {
             .wait()
             .map_err(transport)?;
         let publisher = Arc::new(publisher);
-        if publishers.len() < MAX_PUBLISHERS || publishers.contains_key(key) {
-            *publishers.entry(key.to_owned()).or_default().of(delivery) = Some(Arc::clone(&publisher));
-        }
+        let is_full = publishers.len() >= MAX_PUBLISHERS && !publishers.contains_key(key);
+        let let_go = if is_full { std::mem::take(&mut *publishers) } else { HashMap::new() };
+        *publishers.entry(key.to_owned()).or_default().of(delivery) = Some(Arc::clone(&publisher));
+        drop(publishers);
+        // Undeclaring takes a moment, for which nobody is to wait.
+        drop(let_go);
         Ok(publisher)
     }
 

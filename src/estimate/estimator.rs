@@ -199,8 +199,9 @@ impl<M: Model> Estimator<M> {
         self.tallies.iter().enumerate().map(health).collect()
     }
 
-    /// How the alarms stand; None where there are none.
+    /// How the alarms stand; None where there are none, and before the first window.
     pub fn alarms(&self) -> Option<AlarmsNow> {
+        self.ensemble.as_ref()?;
         let alarms = self.alarms.reports();
         (!alarms.is_empty()).then(|| AlarmsNow { time: self.time(), alarms })
     }

@@ -335,7 +335,6 @@ impl Service {
             slot.account(&mut self.gone);
         }
         self.sink.gone(&name);
-        tracing::info!(bed = name, "let go: silent for long, and there is a new bed");
         true
     }
 

@@ -202,8 +202,8 @@ fn files_of_samples_that_are_read_or_are_somebody_elses_are_not_written_over() {
         ("r", "r", "r: found the record that is read, expected another file to write to"),
         ("other", "r", "r: found the record that is read"),
         ("long.hea", "r.hea", "r.hea: found the record that is read"),
-        ("a.csv", "s", "s.dat: found a file of something else, expected no such file, or one that"),
-        ("a.csv", "t", "t.dat: found a file of something else"),
+        ("a.csv", "s", "s.dat: found a file that no header names, expected no such file, or one that"),
+        ("a.csv", "t", "t.dat: found a file that no header names"),
     ] {
         let (code, said) = refused(&["convert", &folder.text(input), &folder.text(output)]);
         assert_eq!(code, Some(2), "{input} to {output}: {said}");

@@ -597,6 +597,7 @@ async fn a_bed_that_has_been_silent_for_long_makes_room() {
     let said = daemon.stop().await;
     assert_eq!(said.beds(), ["one", "three"]);
     assert_eq!([said.states("one").len(), said.states("three").len()], [20, 20]);
+    assert_eq!(said.kinds("one"), ["start", wire::GONE], "and dashboards are told");
 }
 
 /// A subscriber that hangs until its gate is opened.

@@ -149,6 +149,10 @@ impl Ward {
             return;
         };
         let name = tame(name, MAX_NAME);
+        if matches!(&content, Content::Event(event) if event.kind == wire::GONE) {
+            self.beds.remove(&name);
+            return;
+        }
         let is_new = !self.beds.contains_key(&name);
         if is_new && self.beds.len() >= MAX_BEDS {
             self.refused += 1;
@@ -176,7 +180,20 @@ impl Memory {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::edge::wire::SCHEMA;
+    use crate::edge::wire::{Header, SCHEMA};
+
+    #[test]
+    fn a_bed_that_the_daemon_has_let_go_leaves() {
+        let mut ward = Ward::new("icu", Memory { history_s: 10, rows: 100 });
+        for kind in ["start", wire::GONE] {
+            let header = Header { schema: SCHEMA, seed: 1, config_hash: 2, sequence: 0, time_ns: 0 };
+            let (kind, channel, text) = (kind.to_owned(), String::new(), String::new());
+            let payload = wire::encode(&Event { header, kind, channel, text }).unwrap();
+            let message = Message { key: "icu/bed1/event".to_owned(), encoding: Encoding::Bincode, payload };
+            ward.apply(&message, Duration::ZERO);
+            assert_eq!(ward.beds.len(), usize::from(ward.messages == 1));
+        }
+    }
 
     #[test]
     fn samples_are_those_of_the_pressure_that_their_label_stands_for() {

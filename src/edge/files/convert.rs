@@ -145,8 +145,9 @@ fn refuse_foreign(header: &Path, samples: &Path) -> Result<(), FileError> {
     if named.is_some_and(|record| record.files().iter().any(|file| is_same(file, samples))) {
         return Ok(());
     }
-    let expected = format!("no such file, or one that {} names", header.display());
-    Err(FileError::content(samples, None, "a file of something else", &expected))
+    let header = header.display();
+    let expected = format!("no such file, or one that {header} names; remove what an interrupted conversion left");
+    Err(FileError::content(samples, None, "a file that no header names", &expected))
 }
 
 /// How what is written is called, column by column.

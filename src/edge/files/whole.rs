@@ -10,7 +10,8 @@ use super::error::FileError;
 /// How names of unfinished files end.
 const UNFINISHED: &str = ".tmp";
 
-/// Written beside its place as `.NAME.tmp`, forced to the disk and renamed when finished; removed if it never is.
+/// Written beside its place as `.NAME.tmp`, forced to the disk and renamed when finished; removed if it is
+/// given up, left as it is if the program is killed.
 ///
 /// The name begins with a dot because readers of folders (pyarrow, DuckDB, pandas) pass over such files: a folder stays
 /// readable while one is written and after a crash.

@@ -10,8 +10,8 @@
 //! Crash-safe: rows gather in memory for a few seconds and become a file that is whole as soon as it has its name. Small
 //! parts are merged into `part-FIRST-LAST.parquet`; the name says which parts it holds, so that a part within the range
 //! of another one is a leftover of a merge that was interrupted. [`Playback`](playback::Playback) passes over leftovers
-//! and the next start of a recorder removes them, those of older hours beside its work; somebody else who reads between a
-//! crash and that start sees their rows twice.
+//! and the next start of a recorder removes them, those of older hours beside its work or at a later start; somebody else
+//! who reads before that sees their rows twice, and one who reads while they are merged may miss a file just gone.
 //!
 //! Samples and estimates that the network dropped are asked for where the daemon remembers them, and take their place
 //! before anything is written; see [`gaps`].

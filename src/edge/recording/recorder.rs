@@ -425,8 +425,8 @@ impl Recorder {
         let added = self.add_rest();
         let written = self.write_all();
         let left: usize = self.buffers.values().map(|buffer| buffer.batch.rows()).sum();
-        if left > 0 {
-            tracing::warn!(rows = left, "rows could not be written and are lost");
+        if left > 0 || added.is_err() {
+            tracing::warn!(rows = left, "these rows could not be written, and messages that were to follow them");
         }
         added.and(written)?;
         for buffer in self.buffers.values() {

@@ -167,7 +167,8 @@ impl Request {
 
     fn order(self) -> Option<Order> {
         let Self { bed, author, acknowledge, note, time_ns, .. } = self;
-        if let Some(alarms) = acknowledge {
+        // Without names it would be all, also those that nobody has seen on a page.
+        if let Some(alarms) = acknowledge.filter(|alarms| !alarms.is_empty()) {
             return Some(Order { word: "acknowledge", errand: Errand::Acknowledge { bed, alarms }, author });
         }
         let time = time_ns.and_then(|ns| ns.parse().ok()).map(EventTime);

@@ -6,7 +6,9 @@ import { labelOf } from "./names.js";
 import { decimals, number, range } from "./numbers.js";
 import { clockText, secondsOf } from "./time.js";
 
-const SHOWN_LIMIT = 50;
+/** More than a bed has. */
+const SHOWN_LIMIT = 64;
+const NOTHING_WAITS = "No alarm to acknowledge.";
 
 export class AlarmList {
   /** `onAcknowledge(names)` is called with the names of alarms and says whether that went out. */
@@ -29,7 +31,7 @@ export class AlarmList {
   focus() {
     const button = this.list.querySelector("button");
     if (button) button.focus();
-    else setText(byId("alarm-answer"), "No alarm to acknowledge.");
+    else setText(byId("alarm-answer"), NOTHING_WAITS);
   }
 
   #acknowledge(names) {
@@ -49,6 +51,7 @@ export class AlarmList {
     const focused = this.list.contains(document.activeElement) ? document.activeElement.dataset.alarm : null;
     this.list.replaceChildren(...[...raised, ...others].slice(0, SHOWN_LIMIT).map((alarm) => this.#item(alarm)));
     if (focused !== null) [...this.list.querySelectorAll("button")].find((b) => b.dataset.alarm === focused)?.focus();
+    if (byId("alarm-answer").textContent === NOTHING_WAITS) setText(byId("alarm-answer"), "");
     this.unseen = raised.filter((alarm) => !alarm.acknowledged).map((alarm) => alarm.name);
     setHidden(this.all, this.unseen.length === 0);
     setHidden(byId("no-alarms"), alarms.length > 0);

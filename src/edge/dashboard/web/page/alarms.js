@@ -20,6 +20,12 @@ export function byUrgency(alarms) {
   return (alarms ?? []).filter(isRaised).sort((one, other) => urgency(other) - urgency(one));
 }
 
+/** The raised alarms where not all are shown: those first that nobody has seen, so that none hides behind one that somebody
+ * has. */
+export function unseenFirst(alarms) {
+  return byUrgency(alarms).sort((one, other) => Number(Boolean(one.acknowledged)) - Number(Boolean(other.acknowledged)));
+}
+
 /** Highest priority among raised alarms; empty without one. */
 export function highestPriority(alarms) {
   return byUrgency(alarms)[0]?.priority ?? "";

@@ -2,7 +2,7 @@
 // about once.
 
 import { AlarmList } from "./alarmlist.js";
-import { badge, byUrgency } from "./alarms.js";
+import { badge, highestPriority, unseenFirst } from "./alarms.js";
 import { Charts } from "./charts.js";
 import { byId, element, setAttribute, setHidden, setText } from "./dom.js";
 import { EventLog } from "./eventlog.js";
@@ -194,7 +194,7 @@ export class Bed {
     setText(byId("bed-quality"), head ? qualityText(head) : "");
     setAttribute(byId("bed-quality"), "data-quality", head?.quality ?? "");
     setHidden(byId("bed-unknown"), head?.known !== false);
-    const raised = byUrgency(this.history.latest.alarms);
+    const raised = unseenFirst(this.history.latest.alarms);
     const [shown, others] = [raised.slice(0, 2), raised.length - 2];
     const key = JSON.stringify([shown, others]);
     if (byId("bed-alarms").dataset.key !== key) {
@@ -202,7 +202,7 @@ export class Bed {
       const more = others > 0 ? [element("span", { class: "quiet", text: `+${others} more` })] : [];
       byId("bed-alarms").replaceChildren(...shown.map(badge), ...more);
     }
-    const isHigh = raised[0]?.priority === "high";
+    const isHigh = highestPriority(this.history.latest.alarms) === "high";
     document.title = `${isHigh ? "▲ " : ""}${this.name} · hemostream`;
   }
 }

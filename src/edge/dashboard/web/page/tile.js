@@ -1,6 +1,6 @@
 // One bed of the ward: a link with the numbers that say how the patient is.
 
-import { badge, byUrgency, highestPriority } from "./alarms.js";
+import { badge, byUrgency, highestPriority, unseenFirst } from "./alarms.js";
 import { element, setAttribute, setText } from "./dom.js";
 import { isCurrent, livenessText, outageText, qualityText } from "./liveness.js";
 import { NONE } from "./numbers.js";
@@ -58,7 +58,7 @@ export class Tile {
   }
 
   #updateAlarms(alarms) {
-    const raised = byUrgency(alarms);
+    const raised = unseenFirst(alarms);
     const key = JSON.stringify(raised);
     if (key === this.alarmKey) return;
     this.alarmKey = key;
