@@ -10,10 +10,10 @@ use crate::edge::wire::{
     ParameterEstimate, PressureBlock, STATE_STATISTICS, StateEstimate, Status, Truth,
 };
 use crate::model::Quantity;
-use crate::model::cvsim6::{DERIVED, PARAMETERS, Pressures, STATES};
+use crate::model::cvsim6::{DERIVED, FlowsAndVolumes, PARAMETERS, Pressures, STATES};
 
 /// Pressures, flows and volumes.
-pub(super) const QUANTITIES: usize = STATES.len() + DERIVED.len();
+pub(super) const QUANTITIES: usize = Pressures::LEN + FlowsAndVolumes::LEN;
 /// Nothing for this long, and a bed is stale.
 pub(super) const STALE_AFTER: Duration = Duration::from_secs(2);
 /// An estimate this long without data is called a forecast \[s\].
@@ -606,6 +606,12 @@ pub(super) fn event_time(time_ns: i64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn quantities_are_those_of_the_model() {
+        assert_eq!(quantity_names().count(), QUANTITIES);
+        assert!(quantity_names().eq(Pressures::NAMES.iter().chain(FlowsAndVolumes::NAMES).copied()));
+    }
 
     #[test]
     fn event_time_is_of_day_or_since_the_start() {
